@@ -1,8 +1,9 @@
 """Figures: how one is drawn into a file, and the colours that all of them share."""
 
 import os
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,15 @@ STYLES = ("-", "--", "-.", ":")
 """Line styles of curves that differ by more than their colours, in this order."""
 DPI = 110
 """Pixels an inch."""
+
+
+def without_common_words(names: Sequence[str]) -> list[str]:
+    """Return labels without the words that all have in common: LF_FOOT and RF_FOOT become LF and RF. A name without other
+    words stays whole.
+    """
+    words = [[word for word in re.split(r"[\W_]+", name) if word] for name in names]
+    common = set.intersection(*map(set, words)) if words else set()
+    return [" ".join(w for w in own if w not in common) or name for own, name in zip(words, names, strict=True)]
 
 
 def import_matplotlib() -> None:

@@ -18,7 +18,7 @@ from legged.config.networks import groups_of
 from legged.envs.final_observation import keep_final_step
 from legged.errors import ConfigError, suggest
 from legged.registry import make_task, task_config
-from legged.rendering import ModelCamera, RobotsCamera, camera_of
+from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
 Seen = Literal["actor", "dict"]
 """Form of the observations: the policy's groups side by side, or a dictionary of all groups."""

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
-from legged.play.walking_film import Film, film, walker, write_film
+from legged.play.films import Film, film, walker, write_film
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import ready_to_write

@@ -25,10 +25,10 @@ from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import find_run, run_config
-from legged.play.demonstrations import EPISODE_S, follow_schedule, roll_out, schedule_s, walk_out
+from legged.play.demonstrations import EPISODE_S, SCHEDULE, follow_schedule, roll_out, walk_out
+from legged.play.films import Video
 from legged.play.playground import SETTING, Playground
-from legged.play.video import Video
-from legged.play.viewer import view, watch
+from legged.play.viewer import view
 from legged.policies.actor import Actor
 from legged.policies.episodes import for_episodes
 from legged.policies.export import EXPORTED, export
@@ -37,7 +37,7 @@ from legged.process.command_parser import CommandParser
 from legged.process.headless import HEADLESS
 from legged.process.paths import ready_to_write, relative
 from legged.registry import task_config
-from legged.rendering import window_opens
+from legged.rendering.camera import window_opens
 
 ROOM_MB = 24.0
 """Disk space for the film and the exported policy [MiB]."""
@@ -97,10 +97,8 @@ def main(argv: list[str] | None) -> int:
     if not (HEADLESS or args.headless or args.no_video):
         if not window_opens():
             print("no window opens on this display: recording only")
-        elif isinstance(task, LeggedRobot):
-            view(task, act, playground)
         else:
-            watch(task, act)
+            view(task, act, playground)
     elif not (args.no_video or args.headless) and "DISPLAY" in os.environ:
         print(f"the display {os.environ['DISPLAY']} (DISPLAY) does not answer: recording only")
     shown = min(task.num_envs, len(playground.order) if playground else MOST_SHOWN)
@@ -139,7 +137,7 @@ def _on_ground(
     wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
     playground = Playground.of(wanted, args.terrain, args.difficulty)
     count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE
-    seconds = EPISODE_S if playground else schedule_s()
+    seconds = EPISODE_S if playground else sum(seconds for seconds, _ in SCHEDULE)
     changes = [*undisturbed(count, seconds), *(SETTING if playground else ()), *asked, ("env.num_envs", count)]
     terrain = None
     if playground:

@@ -20,11 +20,8 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.play.live.address import HOST, PORT, check_port, free_port, is_loopback, url
-from legged.play.live.ground import changes_for, check_ground
-from legged.play.live.page import Page, load_viser
-from legged.play.live.session import MOST_ROBOTS, Session
-from legged.play.live.source import find_watched
+from legged.play.live.page import HOST, PORT, Page, free_port, is_loopback, load_viser, url
+from legged.play.live.session import MOST_ROBOTS, Session, changes_for, check_ground, find_watched
 from legged.process.command_parser import CommandParser
 from legged.process.cores import available_cores
 
@@ -58,7 +55,7 @@ def main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
     override_is_no_name(args, "policy")
     register_given(args, "policy")
-    port = free_port(args.host, None if args.port is None else check_port(args.port))
+    port = free_port(args.host, args.port)
     count = ROBOTS if args.num_envs is None else args.num_envs
     if not 1 <= count <= MOST_ROBOTS:
         raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}")
@@ -70,9 +67,9 @@ def main(argv: list[str] | None) -> int:
     if device.type == "cpu":
         engine = [("sim.physics", "mujoco"), ("sim.threads", min(available_cores(), math.ceil(count / ROBOTS_A_THREAD)))]
     changes = changes_for(watched.cfg, count, [*engine, *asked])
-    ground = check_ground(watched.cfg, args.terrain, args.difficulty)
+    kind = check_ground(watched.cfg, args.terrain, args.difficulty)
     load_viser()
-    session = Session(watched, changes, ground, device, graph=device.type == "cuda" and not args.no_graph)
+    session = Session(watched, changes, kind, args.difficulty, device, graph=device.type == "cuda" and not args.no_graph)
     page = Page(session, args.host, port)
     try:
         print(session.title(), flush=True)

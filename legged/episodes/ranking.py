@@ -3,36 +3,24 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from legged.episodes.stored import NO_NUMBERS, TIME_UP, Episodes
 from legged.errors import ConfigError, suggest
 
-
-@dataclass(frozen=True)
-class Column:
-    """A figure of every episode."""
-
-    name: str
-    """Name for --sort."""
-    title: str
-    form: str
-    low_first: bool = False
-    """True if the smallest value is the worst."""
-
-
-COLUMNS = (
-    Column("length", "time [s]", ".2f", low_first=True),
-    Column("return", "return", ".2f", low_first=True),
-    Column("tracking", "velocity RMSE [m/s]", ".3f"),
-    Column("turning", "yaw rate RMSE [rad/s]", ".3f"),
-    Column("energy", "energy [J]", ".0f"),
-    Column("power", "mean power [W]", ".1f"),
-    Column("torque", "largest torque [% of limit]", ".0f"),
-)
-"""Figures by which episodes can be sorted, as far as a task has them."""
+COLUMNS = {
+    "length": ("time [s]", ".2f"),
+    "return": ("return", ".2f"),
+    "tracking": ("velocity RMSE [m/s]", ".3f"),
+    "turning": ("yaw rate RMSE [rad/s]", ".3f"),
+    "energy": ("energy [J]", ".0f"),
+    "power": ("mean power [W]", ".1f"),
+    "torque": ("largest torque [% of limit]", ".0f"),
+}
+"""Name -> title and form of the figures by which episodes can be sorted, as far as a task has them."""
+LOW_FIRST = ("length", "return")
+"""Figures whose smallest value is the worst."""
 FELL = "fell"
 """The order of what failed, the shortest first; then the rest, the worst in tracking or return first."""
 
@@ -42,7 +30,7 @@ class Figures:
     """The figures of E episodes."""
 
     values: dict[str, np.ndarray]
-    """Name of a column -> (E,); only those that the task has."""
+    """Name of a column -> (E,), in the order of COLUMNS; only those that the task has."""
     strained: list[str]
     """The joint with the largest share of its torque limit, in each episode; empty if none has a limit."""
     failed: np.ndarray
@@ -52,30 +40,27 @@ class Figures:
     ends: list[str]
     """Names of everything that can end an episode."""
 
-    @property
-    def columns(self) -> list[Column]:
-        """The columns there are."""
-        return [column for column in COLUMNS if column.name in self.values]
-
 
 def figures_of(episodes: Episodes) -> Figures:
     """Compute the figures of all episodes. Errors are root mean squares over all steps; energy is the sum of |torque *
     velocity| at the ends of control steps, over joints and time; power is energy over the length of the episode.
     """
-    count, strained = len(episodes), []
+    numbers, strained = range(len(episodes)), []
     ends = [*episodes.about["terminations"], TIME_UP, NO_NUMBERS]
-    numbers = range(count)
 
     def each(measure: Callable[[dict[str, np.ndarray]], float]) -> np.ndarray:
         return np.array([measure(episodes.of(i)) for i in numbers])
 
+    def rms(errors: np.ndarray) -> float:  # of the lengths of errors (T, K)
+        return float(np.sqrt(np.square(errors, dtype=np.float64).sum(axis=1).mean()))
+
     seconds = episodes.lengths * episodes.dt
     values = {"length": seconds, "return": each(lambda one: float(one["reward"].sum(dtype=np.float64)))}
     if "command" in episodes:
-        values["tracking"] = each(lambda one: _rms(one["base_lin_vel"][:, :2] - one["command"][:, :2]))
-        values["turning"] = each(lambda one: _rms((one["base_ang_vel"][:, 2] - one["command"][:, 2])[:, None]))
+        values["tracking"] = each(lambda one: rms(one["base_lin_vel"][:, :2] - one["command"][:, :2]))
+        values["turning"] = each(lambda one: rms(one["base_ang_vel"][:, 2:] - one["command"][:, 2:]))
     if "torque" in episodes:
-        values["energy"] = episodes.dt * each(_work_rate)
+        values["energy"] = episodes.dt * each(lambda one: np.abs(one["torque"] * one["joint_vel"]).sum(dtype=np.float64))
         values["power"] = values["energy"] / seconds
         limits = np.array([joint["max_torque"] or np.inf for joint in episodes.about["joints"]], dtype=float)
         shares = np.array([np.abs(episodes.of(i)["torque"]).max(axis=0) / limits for i in numbers])
@@ -86,17 +71,7 @@ def figures_of(episodes: Episodes) -> Figures:
     return Figures(values, strained, episodes["failed"], [episodes.ended(i) for i in numbers], ends)
 
 
-def _work_rate(one: dict[str, np.ndarray]) -> float:
-    """Return the sum over joints and steps of |torque * velocity| [W]."""
-    return float(np.abs(one["torque"] * one["joint_vel"]).sum(dtype=np.float64))
-
-
-def _rms(errors: np.ndarray) -> float:
-    """Return the root of the mean over rows of the squared length of errors (T, K)."""
-    return float(np.sqrt(np.square(errors, dtype=np.float64).sum(axis=1).mean()))
-
-
-def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str = "--sort") -> list[int]:
+def order_of(figures: Figures, by: str, ended_by: str | None = None) -> list[int]:
     """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended.
 
     Raises:
@@ -104,19 +79,15 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str =
     """
     there = [FELL, *figures.values]
     if by not in there:
-        raise ConfigError(f"{flag}: {by}: these episodes have no such figure{suggest(by, there)}")
-    numbers = list(range(len(figures.ended)))
+        raise ConfigError(f"--sort: {by}: these episodes have no such figure{suggest(by, there)}")
     if ended_by is not None:
         check_ended(ended_by, figures.ends)
-        numbers = [i for i in numbers if ended_by in figures.ended[i]]
-    if by == FELL:
-        rest = figures.values.get("tracking", -figures.values["return"])
-        # Among those that failed the shortest first, among the others the worst.
-        length = figures.values["length"]
-        return sorted(numbers, key=lambda i: (0, length[i]) if figures.failed[i] else (1, -_or_worst(rest[i])))
-    column = next(column for column in COLUMNS if column.name == by)
-    sign = 1.0 if column.low_first else -1.0
-    return sorted(numbers, key=lambda i: sign * _or_worst(figures.values[by][i], -sign))
+    values, failed = figures.values, figures.failed.astype(bool)
+    figure = ("tracking" if "tracking" in values else "return") if by == FELL else by
+    key = values[figure] if figure in LOW_FIRST else -values[figure]
+    key = np.where(np.isfinite(key), key, -np.inf)
+    order = np.lexsort((np.where(failed, values["length"], key), ~failed)) if by == FELL else np.argsort(key, kind="stable")
+    return [int(i) for i in order if ended_by is None or ended_by in figures.ended[i]]
 
 
 def check_ended(name: str, ends: Sequence[str]) -> None:
@@ -129,21 +100,15 @@ def check_ended(name: str, ends: Sequence[str]) -> None:
         raise ConfigError(f"--ended: {name}: no episode ends by it{suggest(name, ends)}")
 
 
-def _or_worst(value: Any, sign: float = 1.0) -> float:
-    """Return a number; infinity, the worst value, if it is not finite."""
-    return float(value) if np.isfinite(value) else sign * np.inf
-
-
-def heads_of(figures: Figures) -> list[str]:
-    """Return the heads of the list's columns."""
-    return ["episode", "ended by", *(column.title for column in figures.columns), *(["joint"] if figures.strained else [])]
-
-
-def row_of(figures: Figures, number: int) -> list[str]:
-    """Return the row of an episode."""
-    ended = ", ".join(figures.ended[number]) + (" (failed)" if figures.failed[number] else "")
-    cells = [f"{figures.values[column.name][number]:{column.form}}" for column in figures.columns]
-    return [str(number), ended, *cells, *([figures.strained[number]] if figures.strained else [])]
+def listing(figures: Figures, numbers: Sequence[int]) -> tuple[list[str], list[list[str]]]:
+    """Return the heads of the list's columns, and the rows of some episodes."""
+    joint = ["joint"] if figures.strained else []
+    rows = []
+    for i in numbers:
+        ended = ", ".join(figures.ended[i]) + (" (failed)" if figures.failed[i] else "")
+        cells = [f"{values[i]:{COLUMNS[name][1]}}" for name, values in figures.values.items()]
+        rows.append([str(i), ended, *cells, *(figures.strained[i] for _ in joint)])
+    return ["episode", "ended by", *(COLUMNS[name][0] for name in figures.values), *joint], rows
 
 
 def counts_text(figures: Figures) -> str:

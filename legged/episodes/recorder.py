@@ -1,23 +1,176 @@
-"""Whole episodes of many robots, recorded on the device and fetched in chunks."""
+"""Recordings of a policy's episodes: the task is rebuilt with or without disturbances, and robots run whole episodes, whose
+quantities are recorded on the device at every control step and fetched in chunks.
+"""
 
 import copy
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
+import mujoco
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config import LeggedConfig, TaskConfig, override
+from legged.config.loader import to_dict
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.final_observation import watch_steps
-from legged.episodes.quantities import FLAGS, quantities_of
-from legged.episodes.stored import Episodes
-from legged.evaluation.measurement import Overflows
+from legged.episodes.stored import AXES, FORMAT, Episodes
+from legged.errors import ConfigError
+from legged.evaluation.measurement import Overflows, warn_of_overflows
+from legged.evaluation.result_file import changes_of, device_name
+from legged.physics import engine_name, resolve_physics
+from legged.play.playground import SETTING, Playground
+from legged.policies.episodes import Policy, unit_of
+from legged.policies.restore import TrainedPolicy, restore, undisturbed
 
+MOST_EPISODES = 4096
+"""Most episodes of a recording; at 20 s each they take some gigabytes."""
+GOLDEN = 0.5 * (5.0**0.5 - 1.0)
+"""The golden ratio minus 1."""
+FLAGS = ("failed", "timed_out")
+"""Columns for how an episode ended, before those of the terms."""
 CHUNK_MB = 64.0
 """Size of a chunk of steps on the device [MiB]; a chunk is fetched in one transfer."""
 LONGEST_CHUNK = 100
 """Most steps of a chunk; after each chunk the recorder checks whether all robots have finished."""
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Choices of the command line."""
+
+    episodes: int
+    robots: int
+    as_trained: bool = False
+    """Keep noise, pushes, curricula and randomisation of the training."""
+    command: tuple[float, float, float] | None = None
+    """vx, vy [m/s], yaw rate [rad/s] for all robots; commands of the training if None."""
+    terrain: str | None = None
+    """Type of the tiles, as in play; without it and a difficulty, the ground of the training."""
+    difficulty: float | None = None
+    changes: tuple[tuple[str, Any], ...] = ()
+    """Overrides, applied last."""
+
+
+def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
+    """Return the chosen tiles; None if the task keeps its own ground.
+
+    Raises:
+        ConfigError: a choice does not fit the task.
+    """
+    if not isinstance(policy.cfg, LeggedConfig) and wish.command is not None:
+        raise ConfigError(f"--command: '{policy.cfg.task}' follows no commands")
+    for flag, given in (("terrain", wish.terrain), ("difficulty", wish.difficulty)):
+        if given is not None and not isinstance(policy.cfg, LeggedConfig):
+            raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose")
+        if given is not None and wish.as_trained:
+            raise ConfigError(f"--{flag}: --as-trained takes the ground of the training; leave one of them out")
+    wanted = override(policy.cfg, wish.changes)
+    if not isinstance(wanted, LeggedConfig) or (wish.terrain is None and wish.difficulty is None):
+        return None
+    return Playground.of(wanted, wish.terrain, wish.difficulty)
+
+
+def roll_out(
+    policy: TrainedPolicy, wish: Wish, device: torch.device, graph: bool = True, where: str = "sim.physics"
+) -> tuple[Episodes, TaskConfig]:
+    """Record a policy's episodes on `device`; return them and their task's configuration. `where` names the setting of the
+    engine in errors.
+
+    Raises:
+        ConfigError: a choice does not fit the task, or the checkpoint does not fit.
+        TermError: the step cannot be captured.
+    """
+    playground = check_wish(policy, wish)
+    changes = [("sim.physics", resolve_physics("auto", device)), *_changes(policy, wish, playground)]
+    changed: Any = override(policy.cfg, changes)
+    engine = engine_name(changed.sim, device, where)
+    task, act = restore(policy, changes, device, graph, None if playground is None else playground.build(changed))
+    place = partial(playground.place, task) if playground is not None else None
+    if place is None and not wish.as_trained and getattr(task, "terrain_curriculum", None) is not None:
+        place = partial(spread, task)
+    episodes, lost = record_episodes(task, act, wish.episodes, wish.command, place, graph)
+    warn_of_overflows("episodes", lost)
+    about = _about(task) | {
+        "checkpoint": policy.checkpoint.name,
+        "run": "/".join(policy.folder.resolve().parts[-3:]),
+        "physics": engine,
+        "device": device_name(device),
+        "as_trained": wish.as_trained,
+        "changes": changes_of(wish.changes),
+        "held_command": list(wish.command) if wish.command else None,
+        "ground": {"terrain": wish.terrain, "difficulty": wish.difficulty} if playground is not None else None,
+        "episodes": wish.episodes,
+        "robots": task.num_envs,
+        "seed": task.cfg.env.seed,
+        "contact_overflows": lost,
+    }
+    return replace(episodes, about=about), task.cfg
+
+
+def spread(task: LeggedRobot) -> None:
+    """Put robots on tiles of all levels and types evenly, where they stay. The level of robot i is given by the fractional
+    part of i times the golden ratio, so that the levels of any few robots are far apart.
+    """
+    assert task.terrain_curriculum is not None, "the task stands on a plane"
+    share = torch.arange(task.num_envs, device=task.device) * GOLDEN % 1.0
+    curriculum = task.terrain_curriculum
+    curriculum.place_at((share * curriculum.rows).long(), curriculum.columns.clone())
+
+
+def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -> list[tuple[str, Any]]:
+    """Return the overrides of a recording."""
+    cfg = policy.cfg
+    own: list[tuple[str, Any]] = [("env.num_envs", wish.robots)]
+    if wish.as_trained:
+        drawn = to_dict(cfg.domain_rand)
+        own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
+    elif isinstance(cfg, LeggedConfig):
+        # Episodes keep the length of the training.
+        own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
+        if playground is not None:
+            own += [*SETTING, *playground.changes(cfg)]
+    else:
+        own.append(("observations.add_noise", False))
+    return [*own, *wish.changes, ("env.num_envs", wish.robots)]
+
+
+def _about(task: BaseTask) -> dict[str, Any]:
+    """Return the description of the recorded arrays, which depends on the task only."""
+    legs: dict[str, Any] = {}
+    if isinstance(task, LeggedRobot):
+        robot = task.robot
+        legs = {
+            "robot": robot.name,
+            "mass": robot.mass,
+            "feet": list(robot.feet_names),
+            "contacts": list(robot.contact_names),
+            "contact_threshold": task.contacts.force,
+            "default_joint_pos": robot.default_qpos[list(robot.qpos_columns)].tolist(),
+        }
+    return {
+        "format": FORMAT,
+        "task": task.cfg.task,
+        "dt": task.dt,
+        "sim_dt": task.cfg.sim.dt,
+        "episode_length_s": task.cfg.env.episode_length_s,
+        "reward_unit": unit_of(task),
+        "terminations": list(task.terminations.names),
+        "joints": joints_of(task),
+        **legs,
+        "arrays": {
+            quantity.name: {"unit": quantity.unit, "what": quantity.what, "columns": list(quantity.columns)}
+            for quantity in quantities_of(task)
+            if quantity.name != "ended"
+        },
+    }
+
+
+# ---- steps -------------------------------------------------------------------------------------------------------------
 
 
 class StepRecord:
@@ -55,14 +208,14 @@ def shares_of(episodes: int, robots: int) -> np.ndarray:
 
 def record_episodes(
     task: BaseTask,
-    act: Callable[[TensorDict], Tensor],
+    act: Policy,
     episodes: int,
     command: tuple[float, float, float] | None = None,
     place: Callable[[], None] | None = None,
     graph: bool = True,
 ) -> tuple[Episodes, int]:
-    """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, and how often a
-    robot lost contacts in a step for want of memory.
+    """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, the first of every
+    robot before the second ones, and how often a robot lost contacts in a step for want of memory.
 
     Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off, and short episodes are not more
     frequent than they should be, as they are among the episodes that end first. All robots hold `command`, vx, vy [m/s] and
@@ -77,91 +230,196 @@ def record_episodes(
     task.load_progress(progress)  # curricula went back to their start with the new step
     if place is not None:
         place()
-    gathered, lost = _run(task, act, record, shares_of(episodes, task.num_envs), command)
-    return gathered.episodes(record), lost
+    physics, (n, width), shares = task.physics, record.row.shape, shares_of(episodes, task.num_envs)
+    # Behind the row of a step is the state after resets, in which the next episode may begin.
+    whole = width + physics.qpos.shape[1] + physics.qvel.shape[1]
+    length = max(1, min(LONGEST_CHUNK, int(CHUNK_MB * 2**20 / (4 * n * whole)), task.max_episode_length))
+    buffer = torch.zeros(length, n, whole, device=task.device)
+    flags = slice(width - record.widths[-1], width - record.widths[-1] + len(FLAGS))
+    with torch.inference_mode():
+        observations, overflows = task.reset(), Overflows()
+        if command is not None and isinstance(task, LeggedRobot):
+            observations = task.hold_commands(buffer.new_tensor(command))
+        torch.cat([record.row, physics.qpos, physics.qvel], dim=1, out=buffer[0])
+        chunks, finished = [np.array(buffer[:1].cpu())], np.zeros(n, dtype=int)
+        while (finished < shares).any():
+            for row in buffer:
+                observations, _, _, extras = task.step(act(observations))
+                overflows.add(extras)
+                torch.cat([record.row, physics.qpos, physics.qvel], dim=1, out=row)
+            chunks.append(np.array(buffer.cpu()))
+            finished += chunks[-1][:, :, flags].any(axis=2).sum(axis=0)
+    steps = np.concatenate(chunks)
+    del chunks
+    spans = []  # episode of its robot, robot, row before the first step, last row
+    for robot, share in enumerate(shares):
+        ends = np.flatnonzero(steps[1:, robot, flags].any(axis=1))[:share] + 1
+        spans += [(k, robot, begin, end) for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()]))]
+    spans.sort()
+    arrays = record.split(np.concatenate([steps[begin + 1 : end + 1, robot, :width] for _, robot, begin, end in spans]))
+    first = np.array([steps[begin, robot, width:] for _, robot, begin, _ in spans])
+    starts = np.cumsum([0, *(end - begin for _, _, begin, end in spans)])
+    ended = arrays.pop("ended")[starts[1:] - 1].astype(bool)
+    per_episode = {
+        "episode_start": starts,
+        "robot": np.array([robot for _, robot, _, _ in spans]),
+        "failed": ended[:, 0],
+        "timed_out": ended[:, 1],
+        "ended_by": ended[:, len(FLAGS) :],
+        "first_qpos": first[:, : physics.qpos.shape[1]],
+        "first_qvel": first[:, physics.qpos.shape[1] :],
+    }
+    return Episodes({**arrays, **per_episode}, {}), overflows.total(task)
 
 
-@torch.inference_mode()
-def _run(
-    task: BaseTask,
-    act: Callable[[TensorDict], Tensor],
-    record: StepRecord,
-    shares: np.ndarray,
-    command: tuple[float, float, float] | None,
-) -> tuple["_Gathered", int]:
-    """Step until every robot has finished its episodes."""
-    n, width, device = task.num_envs, record.row.shape[1], torch.device(task.device)
-    first_states = task.physics.qpos.shape[1] + task.physics.qvel.shape[1]
-    longest = int(CHUNK_MB * 2**20 / (4 * n * (width + first_states)))
-    length = max(1, min(LONGEST_CHUNK, longest, task.max_episode_length))
-    buffer = torch.zeros(length, n, width + first_states, device=device)
-    observations, overflows = task.reset(), Overflows()
-    if command is not None and isinstance(task, LeggedRobot):
-        observations = task.hold_commands(torch.tensor(command, device=device))
-    gathered = _Gathered(shares, _state(task).cpu().numpy(), width, width - record.widths[-1])
-    while not gathered.complete:
-        for step in range(length):
-            observations, _, _, extras = task.step(act(observations))
-            overflows.add(extras)
-            buffer[step, :, :width].copy_(record.row)
-            buffer[step, :, width:].copy_(_state(task))
-        gathered.add(buffer.cpu().numpy())
-    return gathered, overflows.total(task)
+# ---- quantities --------------------------------------------------------------------------------------------------------
 
 
-def _state(task: BaseTask) -> Tensor:
-    """Return (N, nq + nv) generalised positions and velocities."""
-    return torch.cat([task.physics.qpos, task.physics.qvel], dim=1)
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of N robots at the end of a control step."""
+
+    name: str
+    read: Callable[[], Tensor]
+    """Return its current values (N, ...)."""
+    unit: str
+    what: str
+    """Description, with the frame if it has one."""
+    columns: tuple[str, ...] = ()
+    """Names along its second axis, if it has one."""
 
 
-class _Gathered:
-    """Episodes of N robots, assembled on the host from chunks of steps."""
+def quantities_of(task: BaseTask) -> list[Quantity]:
+    """Return the recorded quantities of a task; `ended` comes last."""
+    physics, rewards, terms = task.physics, task.rewards, task.terminations
+    model = physics.model
 
-    def __init__(self, shares: np.ndarray, first_states: np.ndarray, width: int, ended: int) -> None:
-        """Collect `shares` (N,) episodes, which begin in `first_states` (N, S). Rows are `width` wide; the flags of how an
-        episode ended begin at the column `ended`.
-        """
-        self._shares, self._width, self._flags = shares, width, slice(ended, ended + len(FLAGS))
-        self._begun: list[list[np.ndarray]] = [[] for _ in shares]
-        self._first = first_states.copy()
-        self._finished: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in shares]
+    def ended() -> Tensor:
+        return torch.stack([terms.failed, terms.timed_out, *terms.found], dim=1)
 
-    @property
-    def complete(self) -> bool:
-        """True if every robot has finished its episodes."""
-        return all(len(own) == share for own, share in zip(self._finished, self._shares, strict=True))
+    return [
+        Quantity("qpos", lambda: physics.qpos, "m, rad", "generalised positions in MuJoCo's layout", _coordinates(model, 0)),
+        Quantity("qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, likewise", _coordinates(model, 1)),
+        Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
+        Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; below 0 it may have been cut off"),
+        Quantity("reward_parts", lambda: rewards.last.t(), "1", "scale times term of this step", rewards.names),
+        *(_of_legs(task) if isinstance(task, LeggedRobot) else _of_motors(task)),
+        Quantity("ended", ended, "1", "failed, out of time, and by which terms", (*FLAGS, *terms.names)),
+    ]
 
-    def add(self, chunk: np.ndarray) -> None:
-        """Add steps (T, N, width + S): rows, and the states after them, which are those of new episodes after an end."""
-        over = np.asarray(chunk[:, :, self._flags].any(axis=2))
-        for robot, own in enumerate(self._finished):
-            begin = 0
-            for last in np.flatnonzero(over[:, robot]).tolist():
-                if len(own) == self._shares[robot]:
-                    break
-                rows = np.concatenate([*self._begun[robot], chunk[begin : last + 1, robot, : self._width]])
-                own.append((rows, self._first[robot].copy()))
-                self._first[robot] = chunk[last, robot, self._width :]
-                self._begun[robot], begin = [], last + 1
-            if len(own) < self._shares[robot]:
-                self._begun[robot].append(chunk[begin:, robot, : self._width].copy())
 
-    def episodes(self, record: StepRecord) -> Episodes:
-        """Return the episodes in order: the first of every robot, then the second."""
-        numbered = sorted((k, robot) for robot, own in enumerate(self._finished) for k in range(len(own)))
-        rows = [self._finished[robot][k][0] for k, robot in numbered]
-        arrays = record.split(np.concatenate(rows))
-        ends = np.cumsum([len(part) for part in rows])
-        ended = arrays.pop("ended")[ends - 1].astype(bool)
-        qpos_width = arrays["qpos"].shape[1]
-        first = np.array([self._finished[robot][k][1] for k, robot in numbered])
-        per_episode = {
-            "episode_start": np.array([0, *ends]),
-            "robot": np.array([robot for _, robot in numbered]),
-            "failed": ended[:, 0],
-            "timed_out": ended[:, 1],
-            "ended_by": ended[:, len(FLAGS) :],
-            "first_qpos": first[:, :qpos_width],
-            "first_qvel": first[:, qpos_width:],
+def joints_of(task: BaseTask) -> list[dict[str, Any]]:
+    """Return the joints with a motor, in the order of the motors, as plain values for a JSON file: `name`; `unit` of the
+    position, rad, or m for a slide; the columns `qpos` and `qvel` of the generalised coordinates; `range`, the lowest and
+    highest position, None without stops; `max_velocity`; and `max_torque`, the largest nominal torque [N m] either way, or
+    force [N] of a slide, None without a limit. The list is empty if a motor drives something other than one joint.
+    """
+    model = task.physics.model
+    if isinstance(task, LeggedRobot):
+        robot, turning = task.robot, [True] * len(task.robot.joint_names)
+        names, positions, velocities = robot.joint_names, robot.qpos_columns, robot.qvel_columns
+        ranges, fastest = np.asarray(robot.dof_pos_limits), robot.dof_vel_limits
+        strongest = task.control.nominal["torque_limit"].tolist()
+    elif _all_motors(model):
+        numbers = model.actuator_trnid[:, 0]
+        names, turning = [model.joint(j).name for j in numbers], model.jnt_type[numbers] == mujoco.mjtJoint.mjJNT_HINGE
+        positions, velocities = model.jnt_qposadr[numbers], model.jnt_dofadr[numbers]
+        limited = model.jnt_limited[numbers, None].astype(bool)
+        ranges, fastest = np.where(limited, model.jnt_range[numbers], np.inf), [np.inf] * model.nu
+        strongest = np.abs(_control_ranges(model)).max(axis=0) * np.abs(_torque_per_control(model))
+    else:
+        return []
+    return [
+        {
+            "name": names[i],
+            "unit": "rad" if turning[i] else "m",
+            "qpos": int(positions[i]),
+            "qvel": int(velocities[i]),
+            "range": [float(limit) for limit in ranges[i]] if np.isfinite(ranges[i]).all() else None,
+            "max_velocity": float(fastest[i]) if np.isfinite(fastest[i]) else None,
+            "max_torque": float(strongest[i]) if np.isfinite(strongest[i]) else None,
         }
-        return Episodes({**arrays, **per_episode}, {})
+        for i in range(len(names))
+    ]
+
+
+def _of_legs(task: LeggedRobot) -> list[Quantity]:
+    """Return the quantities of legged robots."""
+    joints, feet, shapes = task.robot.joint_names, task.robot.feet_names, task.robot.contact_names
+    columns, velocity = task.feet_indices, "m/s, m/s, rad/s"
+    commanded = "velocity that was asked for in this step, base frame"
+    force = "contact forces on the feet at the last physics step, world frame, by x, y, z"
+    sizes = "size of the contact force on every tracked shape"
+    return [
+        Quantity("base_lin_vel", lambda: task.base_lin_vel, "m/s", "velocity of the base, base frame", AXES),
+        Quantity("base_ang_vel", lambda: task.base_ang_vel, "rad/s", "angular velocity of the base, base frame", AXES),
+        Quantity("ground", lambda: task.height_scan.ground, "m", "height of the ground below the base, world frame"),
+        Quantity("joint_pos", lambda: task.dof_pos, "rad", "angles of the joints with a motor", joints),
+        Quantity("joint_vel", lambda: task.dof_vel, "rad/s", "and their velocities", joints),
+        Quantity("torque", lambda: task.torques, "N m", "torques of the last physics step", joints),
+        Quantity("command", lambda: task.commands[:, :3], velocity, commanded, ("vx", "vy", "yaw")),
+        Quantity("feet_pos", lambda: task.feet_pos, "m", "centres of the feet, world frame, by x, y, z", feet),
+        Quantity("feet_force", lambda: task.contact_forces.index_select(1, columns), "N", force, feet),
+        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot touches, or did a step before", feet),
+        Quantity("contact_force", lambda: task.contact_forces.norm(dim=2), "N", sizes, shapes),
+    ]
+
+
+def _of_motors(task: BaseTask) -> list[Quantity]:
+    """Return the quantities of a model with motors on its joints; nothing for other actuators."""
+    model, physics, joints = task.physics.model, task.physics, joints_of(task)
+    if not joints:
+        return []
+    names = tuple(joint["name"] for joint in joints)
+    units = "rad" if all(joint["unit"] == "rad" for joint in joints) else "rad, m"
+    positions, velocities = torch.tensor([[joint[name] for joint in joints] for name in ("qpos", "qvel")]).to(physics.device)
+    low, high = torch.as_tensor(_control_ranges(model), dtype=torch.float32, device=physics.device)
+    per_control = torch.as_tensor(_torque_per_control(model), dtype=torch.float32, device=physics.device)
+    return [
+        Quantity("joint_pos", lambda: physics.qpos.index_select(1, positions), units, "joints with a motor", names),
+        Quantity("joint_vel", lambda: physics.qvel.index_select(1, velocities), f"{units} per s", "and velocities", names),
+        Quantity("torque", lambda: physics.ctrl.clamp(low, high) * per_control, "N m", "torques of the motors", names),
+    ]
+
+
+def _all_motors(model: mujoco.MjModel) -> bool:
+    """Return whether every actuator is a motor on one hinge or slide, with a torque proportional to its control."""
+    if not model.nu or (model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT).any():
+        return False
+    kinds = model.jnt_type[model.actuator_trnid[:, 0]]
+    return bool(
+        np.isin(kinds, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)).all()
+        and (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED).all()
+        and (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE).all()
+        and (model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE).all()
+        and not model.actuator_forcelimited.any()
+    )
+
+
+def _torque_per_control(model: mujoco.MjModel) -> np.ndarray:
+    return model.actuator_gear[:, 0] * model.actuator_gainprm[:, 0]
+
+
+def _control_ranges(model: mujoco.MjModel) -> np.ndarray:
+    """Return the least and the greatest control (2, nu) of every motor; infinite without a range."""
+    limited = model.actuator_ctrllimited[:, None].astype(bool)
+    return np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf]).T
+
+
+def _actions(task: BaseTask) -> tuple[str, ...]:
+    if isinstance(task, LeggedRobot):
+        return tuple(task.robot.joint_names[i] for i in task.control.acted)
+    model = task.physics.model
+    return tuple(model.actuator(i).name or f"actuator {i}" for i in range(model.nu))
+
+
+def _coordinates(model: mujoco.MjModel, derivative: int) -> tuple[str, ...]:
+    """Return the names of the generalised positions, or with `derivative` 1 of the velocities: `<joint>.<part>`."""
+    turn = tuple(f"w{axis}" for axis in AXES) if derivative else ("qw", "qx", "qy", "qz")
+    parts = {mujoco.mjtJoint.mjJNT_FREE: (*AXES, *turn), mujoco.mjtJoint.mjJNT_BALL: turn}
+    found: list[str] = []
+    for i in range(model.njnt):
+        name = model.joint(i).name or f"joint {i}"
+        inner = parts.get(mujoco.mjtJoint(int(model.jnt_type[i])))
+        found += [name] if inner is None else [f"{name}.{part}" for part in inner]
+    return tuple(found)

@@ -1,4 +1,6 @@
-"""Recorded episodes, in memory and as files: the arrays in episodes.npz, their description in episodes.json."""
+"""Recorded episodes, in memory and as files: the arrays in episodes.npz, their description in episodes.json, and a flat table
+for tools that read Parquet. What is read may come from anywhere, so it is checked.
+"""
 
 import json
 import zipfile
@@ -11,21 +13,49 @@ import numpy as np
 
 from legged.config import TaskConfig, from_dict, to_yaml
 from legged.config.yaml_files import read_yaml
-from legged.episodes.stored_check import PER_EPISODE, check_stored
 from legged.errors import ConfigError
+from legged.evaluation.json_forms import INDEX, NUMBER, POSITIVE, TEXT, OrNull, check_form, wrong_form
 from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.registry import task_schema
 
-ARRAYS, ABOUT, CONFIG = "episodes.npz", "episodes.json", "episodes.yaml"
-"""Files: arrays, their description, and the configuration of their task."""
-MADE_OF_THEM = ("episodes.md", "episodes.parquet", "episode_[0-9]*.html", "joint_statistics.*")
+ARRAYS, ABOUT, CONFIG, TABLE = "episodes.npz", "episodes.json", "episodes.yaml", "episodes.parquet"
+"""Files: arrays, their description, the configuration of their task, and the flat table."""
+MADE_OF_THEM = ("episodes.md", TABLE, "episode_[0-9]*.html", "joint_statistics.*")
 """Patterns of the files that are made from a recording, in the same folder."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
 """Names for ends without a term: out of time, and physics that blew up."""
-
-
+AXES = ("x", "y", "z")
 DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
 """Errors that json, zipfile and NumPy raise for damaged files."""
+FORMAT = 1
+"""Version of episodes.json; it grows when older files can no longer be read."""
+PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
+"""Arrays with a row an episode: its first row (and the row behind the last episode); the robot that ran it; flags of an end
+by a failure, of an end by time or a term that is no failure, and of all terms, in the order of `terminations`; positions and
+velocities before its first step. The other arrays have a row a control step, one episode after the other.
+"""
+ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
+JOINTS = ("joint_pos", "joint_vel", "torque")
+JOINT = {
+    "name": TEXT,
+    "unit": {"rad", "m"},
+    **dict.fromkeys(("qpos", "qvel"), INDEX),
+    "range": OrNull((NUMBER, NUMBER)),
+    **dict.fromkeys(("max_velocity", "max_torque"), OrNull(POSITIVE)),
+}
+FORM: dict[str, Any] = {
+    "format": {FORMAT},
+    **dict.fromkeys(("task", "checkpoint", "run"), TEXT),
+    **dict.fromkeys(("dt", "reward_unit"), POSITIVE),
+    "terminations": [TEXT],
+    "joints": [JOINT],
+    "ground?": OrNull({"terrain?": OrNull(TEXT), "difficulty?": OrNull(NUMBER)}),
+    "changes?": {},
+    "held_command?": OrNull([NUMBER]),
+}
+"""Form of episodes.json."""
+LEGGED_FORM = {"contact_threshold": POSITIVE, "feet": [TEXT, ...], "contacts": [TEXT]}
+"""Form of the parts that only legged robots have."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +106,12 @@ class Episodes:
         terms = self.about["terminations"]
         found = [term for term, mine in zip(terms, self.arrays["ended_by"][number], strict=True) if mine]
         return found or [NO_NUMBERS if self.arrays["failed"][number] else TIME_UP]
+
+
+def joint_unit(array: str, of_position: str) -> str:
+    """Return the unit of an array of joints, for a joint whose position is in radians or metres."""
+    turning = of_position == "rad"
+    return {"joint_pos": of_position, "joint_vel": f"{of_position}/s", "torque": "N m" if turning else "N"}[array]
 
 
 def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
@@ -136,3 +172,71 @@ def load_config(folder: Path, where: str) -> TaskConfig:
         raise ConfigError(f"{where}: {relative(folder)} holds no {CONFIG}")
     data = read_yaml(path)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
+
+
+def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
+    """Check episodes.json, and that the arrays of episodes.npz fit it: their readers rely on shapes and names. `where` names
+    the folder.
+
+    Raises:
+        ConfigError: something is missing, has another type, or does not fit the rest.
+    """
+    damaged, legged = f"{where}: the episodes there are damaged", "command" in arrays
+    of_steps = [name for name in arrays if name not in PER_EPISODE]
+    described = {"arrays": {name: {"columns": [TEXT]} for name in of_steps}}
+    check_form(about, FORM | (LEGGED_FORM if legged else {}) | described, damaged)
+    shapes: dict[str, tuple[int, ...]] = {"ended_by": (len(about["terminations"]),)}
+    shapes |= {name: (len(about["joints"]),) for name in JOINTS if legged or name in arrays}
+    if legged:
+        feet = len(about["feet"])
+        shapes |= dict.fromkeys(("base_lin_vel", "base_ang_vel", "command"), (3,))
+        shapes |= dict.fromkeys(("feet_pos", "feet_force"), (feet, 3))
+        shapes |= {"ground": (), "feet_contact": (feet,), "contact_force": (len(about["contacts"]),)}
+    missing = [name for name in (*PER_EPISODE, *ALWAYS, *shapes) if name not in arrays]
+    if missing:
+        raise ConfigError(f"{damaged}: {', '.join(missing)} missing")
+    start, failed = arrays["episode_start"], arrays["failed"]
+    count = len(failed) if failed.ndim == 1 else 0
+    whole = start.shape == (count + 1,) and start.dtype.kind in "iu" and count > 0
+    if not whole or start[0] != 0 or (start[1:] <= start[:-1]).any():
+        raise ConfigError(f"{damaged}: episode_start does not say where {count} episodes begin")
+    for name, array in arrays.items():
+        wanted = count + (name == "episode_start") if name in PER_EPISODE else int(start[-1])
+        if array.ndim == 0 or array.dtype.kind not in "biuf" or len(array) != wanted:
+            got = f"shape {array.shape} of {array.dtype}"
+            raise ConfigError(f"{damaged}: {name}: expected {wanted} rows of numbers, got {got}")
+    for name in of_steps:
+        columns, shape = about["arrays"][name]["columns"], arrays[name].shape[1:]
+        named = (len(columns),) if columns or shape else ()
+        if shape not in (named, (*named, 3)):
+            raise wrong_form(damaged, f"arrays.{name}.columns", f"names for an array of shape {arrays[name].shape}", columns)
+    for i, joint in enumerate(about["joints"]):
+        for column in ("qpos", "qvel"):
+            if joint[column] >= arrays[column].shape[1]:
+                raise wrong_form(damaged, f"joints[{i}].{column}", f"a column of {column}", joint[column])
+    if legged and arrays["qpos"].shape[1:] < (7,):
+        raise ConfigError(f"{damaged}: qpos has no place for a floating base")
+    for name, shape in shapes.items():
+        if arrays[name].shape[1:] != shape:
+            raise ConfigError(f"{damaged}: {name}: expected rows of shape {shape}, got {arrays[name].shape[1:]}")
+
+
+def write_parquet(episodes: Episodes, folder: Path) -> None:
+    """Write TABLE into `folder`, a row a control step. Its columns are episode, time [s], and those of all arrays by name,
+    `torque.LF_HAA` or `feet_force.LF_FOOT.x`.
+
+    Raises:
+        RunError: the file can't be written.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    flat = clock_of(episodes)
+    for name in episodes.of(0):
+        labels = [f"{name}.{column}" for column in episodes.columns(name)] or [name]
+        if episodes[name].ndim == 3:
+            labels = [f"{label}.{axis}" for label in labels for axis in AXES]
+        flat |= dict(zip(labels, episodes[name].reshape(len(episodes[name]), -1).T, strict=True))
+    with replacing(folder / TABLE) as part:
+        parquet.write_table(pyarrow.table(flat), part)
+    print(f"written: {relative(folder / TABLE)}")

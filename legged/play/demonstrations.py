@@ -2,19 +2,16 @@
 terrain, or, in tasks without commands, go through an episode.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from rich.markup import escape
-from rich.table import Table
-from tensordict import TensorDict
+from rich.table import Column, Table
 from torch import Tensor
 
 from legged.envs import BaseTask, LeggedRobot
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
+from legged.play.films import Video
 from legged.play.playground import Playground
-from legged.play.video import Video
 from legged.policies.episodes import Policy, episodes_table, measure_episodes
 
 SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
@@ -43,8 +40,8 @@ class TrackingErrors:
     COLUMNS = ("velocity RMSE", "yaw rate RMSE", "falls")
     """Columns of a `row`."""
 
-    def __init__(self, num_envs: int, device: torch.device) -> None:
-        self.steps, self.lin, self.ang, self.falls = (torch.zeros(num_envs, device=device) for _ in range(4))
+    def __init__(self, task: LeggedRobot) -> None:
+        self.steps, self.lin, self.ang, self.falls = torch.zeros(4, task.num_envs, device=task.device)
         """(N,) each: measured control steps, summed squared errors of vx and vy [m^2/s^2] and yaw rate [rad^2/s^2], falls."""
 
     def add(self, task: LeggedRobot, measured: Tensor) -> None:
@@ -66,30 +63,20 @@ def velocities(task: LeggedRobot, robots: slice) -> list[str]:
     """Return lines with the commanded velocity of the first of `robots` and the mean actual velocity of all of them."""
     wanted = task.commands[robots][0, :3].tolist()
     actual = [*task.base_lin_vel[robots, :2].mean(dim=0).tolist(), float(task.base_ang_vel[robots, 2].mean())]
-    return [
-        f"{name}  {v[0]:+.2f}  {v[1]:+.2f} m/s  {v[2]:+.2f} rad/s" for name, v in (("commanded", wanted), ("actual", actual))
-    ]
-
-
-def schedule_s() -> float:
-    """Return the duration of the schedule [s]."""
-    return sum(seconds for seconds, _ in SCHEDULE)
+    text = "{}  {:+.2f}  {:+.2f} m/s  {:+.2f} rad/s"
+    return [text.format("commanded", *wanted), text.format("actual", *actual)]
 
 
 @torch.inference_mode()
-def follow_schedule(task: LeggedRobot, act: Callable[[TensorDict], Tensor], video: Video) -> Table:
+def follow_schedule(task: LeggedRobot, act: Policy, video: Video) -> Table:
     """Run the schedule on all robots, filmed by `video`; return a table of errors and falls."""
-    table = Table(title="following commands", title_justify="left")
-    table.add_column(escape("vx, vy [m/s], yaw [rad/s]"), justify="left")
-    for name in TrackingErrors.COLUMNS:
-        table.add_column(name, justify="right")
-    device = torch.device(task.device)
+    table = _table("following commands", "vx, vy [m/s], yaw [rad/s]")
     low, high = task.command_sampler.full_ranges.cpu().numpy().T
     task.reset()
     for seconds, wanted in SCHEDULE:
         command = np.clip(np.array(wanted), low, high)
-        observations = task.hold_commands(torch.tensor(command, dtype=torch.float32, device=device))
-        errors = TrackingErrors(task.num_envs, device)
+        errors = TrackingErrors(task)
+        observations = task.hold_commands(errors.steps.new_tensor(command))
         for step in range(max(1, round(seconds / task.dt))):
             observations, _, _, _ = task.step(act(observations))
             settled = task.episode_length_buf * task.dt >= SETTLE_S
@@ -101,41 +88,39 @@ def follow_schedule(task: LeggedRobot, act: Callable[[TensorDict], Tensor], vide
 
 
 @torch.inference_mode()
-def walk_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Playground, video: Video) -> Table:
+def walk_out(task: LeggedRobot, act: Policy, playground: Playground, video: Video) -> Table:
     """Walk the robots along x from the middle of their tiles, filmed by `video`; return a table of errors and falls by
     terrain type.
     """
     assert task.terrain is not None, "the task stands on a plane"
-    device = torch.device(task.device)
-    errors = TrackingErrors(task.num_envs, device)
+    errors = TrackingErrors(task)
     low, high = task.command_sampler.full_ranges[0].tolist()
-    command = torch.tensor([min(max(FORWARD, low), high), 0.0, 0.0], device=device)
+    speed = min(max(FORWARD, low), high)
+    command, heading = errors.steps.new_tensor([speed, 0.0, 0.0]), torch.zeros_like(errors.steps)
     playground.place(task)
     for episode in range(EPISODES):
         task.reset()
-        observations = task.hold_commands(command, torch.zeros(task.num_envs, device=device))
+        observations = task.hold_commands(command, heading)
         followed = episode % task.num_envs
-        video.follow(followed)
         for step in range(max(1, round(EPISODE_S / task.dt))):
             observations, _, _, _ = task.step(act(observations))
             errors.add(task, task.episode_length_buf * task.dt >= SETTLE_S)  # robots that were reset are left out
             if video.due(step):
                 where = playground.label(task.terrain, task.base_pos[followed].tolist())
-                video.take(*velocities(task, slice(followed, followed + 1)), where)
-    return _table(errors, playground, task.num_envs, float(command[0]))
-
-
-def _table(errors: TrackingErrors, playground: Playground, num_envs: int, speed: float) -> Table:
-    title = f"walking out at {speed:g} m/s, {EPISODES} times {EPISODE_S:g} s"
-    table = Table(title=title, title_justify="left")
-    for name in ("terrain", "robots", *errors.COLUMNS):
-        table.add_column(name, justify="left" if name == "terrain" else "right")
-    kinds = [playground.rows[0][column].type for column in playground.columns(num_envs)]
+                video.take(*velocities(task, slice(followed, followed + 1)), where, followed=followed)
+    table = _table(f"walking out at {speed:g} m/s, {EPISODES} times {EPISODE_S:g} s", "terrain", "robots")
+    kinds = [playground.rows[0][column].type for column in playground.columns(task.num_envs)]
     for kind, label in playground.labels().items():
-        robots = torch.tensor([own == kind for own in kinds], device=errors.steps.device)
+        robots = errors.steps.new_tensor([own == kind for own in kinds], dtype=torch.bool)
         if robots.any():
             table.add_row(escape(label), str(int(robots.sum())), *errors.row(robots))
     return table
+
+
+def _table(title: str, first: str, *others: str) -> Table:
+    """Return an empty table of tracking errors, with columns before them, of which the first holds texts."""
+    numbers = [Column(name, justify="right") for name in (*others, *TrackingErrors.COLUMNS)]
+    return Table(Column(escape(first)), *numbers, title=title, title_justify="left")
 
 
 def roll_out(task: BaseTask, act: Policy, video: Video) -> Table:

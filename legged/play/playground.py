@@ -48,38 +48,35 @@ class Playground:
             raise ConfigError(f"--difficulty: must be between 0 and 1, got {difficulty:g}")
         if name is not None:
             terrain_type(name, "--terrain")
-        if name is None and cfg.terrain.mesh_type == "plane":
+            columns = [name] * COLUMNS
+            order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
+        elif cfg.terrain.mesh_type == "plane":
             if difficulty is not None:
                 raise ConfigError(f"--difficulty: {cfg.task} stands on a plane; name a type with --terrain")
             return None
-        columns: Sequence[str]
-        if name is None:
+        else:
             check_terrain(cfg.terrain, cfg.origins)
             shares = cfg.terrain.proportions
             columns = [kind for kind, share in shares.items() if share > 0.0]
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
-        else:
-            columns = [name] * COLUMNS
-            order = sorted(range(COLUMNS), key=lambda c: abs(c - 0.5 * (COLUMNS - 1)))
 
-        def size_of(kind: str, d: float) -> float:
-            """Return the size of the training if it is fixed and no difficulty is given."""
-            return tile_size(cfg.terrain, kind, d) if difficulty is None else TERRAIN_TYPES[kind].sized(d, cfg.terrain.scale)
+        def tile(kind: str, d: float) -> TileSpec:
+            """Return a tile of the training's size if that is fixed and no difficulty is given."""
+            fixed = difficulty is None
+            return TileSpec(
+                kind, tile_size(cfg.terrain, kind, d) if fixed else TERRAIN_TYPES[kind].sized(d, cfg.terrain.scale)
+            )
 
         front, back = (
-            tuple(TileSpec(kind, size_of(kind, d)) for kind in columns)
+            tuple(tile(kind, d) for kind in columns)
             for d in (DIFFICULTIES if difficulty is None else (difficulty, difficulty))
         )
         return cls((front, back), tuple(order))
 
-    @property
-    def types(self) -> list[str]:
-        """Return the types of the tiles, each once."""
-        return list(dict.fromkeys(spec.type for spec in self.rows[0]))
-
     def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
         """Return overrides that put a task of configuration `cfg` on this ground, with unchanged observations."""
-        shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | dict.fromkeys(self.types, 1.0 / len(self.types))
+        kinds = {spec.type for spec in self.rows[0]}
+        shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | {spec.type: 1.0 / len(kinds) for spec in self.rows[0]}
         return [
             ("terrain.mesh_type", "height_map"),
             ("terrain.curriculum", False),
@@ -112,19 +109,16 @@ class Playground:
 
     def label(self, terrain: Terrain, base_pos: Sequence[float]) -> str:
         """Return the name of the tile below or nearest to `base_pos` (x, y, ...): 'stairs_up, step height 0.194 m'."""
-        first = terrain.origins[0, 0]
-        r, c = (
-            int(np.clip(np.round((base_pos[axis] - first[axis]) / terrain.tile_size[axis]), 0, count - 1))
-            for axis, count in enumerate(terrain.origins.shape[:2])
-        )
-        return label(self.rows[r][c].type, [self.rows[r][c].size])
+        tiles = np.round((np.array(base_pos[:2]) - terrain.origins[0, 0, :2]) / terrain.tile_size)
+        row, column = np.clip(tiles, 0, np.array(terrain.origins.shape[:2]) - 1).astype(int)
+        return label(self.rows[row][column].type, [self.rows[row][column].size])
 
     def labels(self) -> dict[str, str]:
         """Return type -> its name with all its sizes."""
-        return {
-            kind: label(kind, list(dict.fromkeys(spec.size for row in self.rows for spec in row if spec.type == kind)))
-            for kind in self.types
-        }
+        sizes: dict[str, dict[float, None]] = {}  # in order, each once
+        for spec in (*self.rows[0], *self.rows[1]):
+            sizes.setdefault(spec.type, {})[spec.size] = None
+        return {kind: label(kind, list(own)) for kind, own in sizes.items()}
 
 
 def label(kind: str, sizes: Sequence[float]) -> str:

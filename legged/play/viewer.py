@@ -1,17 +1,15 @@
 """MuJoCo's viewer with keyboard commands."""
 
 import time
-from collections.abc import Callable
-from typing import Any
 
-import mujoco
 import torch
 from tensordict import TensorDict
-from torch import Tensor
 
 from legged.envs import BaseTask, LeggedRobot
 from legged.play.playground import Playground
-from legged.rendering import display_model, drawn_model, follow_root, size_of
+from legged.policies.episodes import Policy
+from legged.rendering.camera import drawn_model, follow_root, size_of
+from legged.rendering.scene import display_model
 
 STEP = (0.1, 0.1, 0.2)
 """Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
@@ -19,10 +17,6 @@ UP, DOWN, LEFT, RIGHT, SPACE, COMMA, PERIOD, BACKSPACE, NEXT = 265, 264, 263, 26
 HELP = """viewer: up/down vx, left/right yaw rate, comma/period vy, space stands still, backspace starts anew;
 close the window to record the video"""
 HELP_WITHOUT_COMMANDS = "viewer: backspace starts anew; close the window to record the video"
-HELP_ON_TERRAIN = "n goes to the next tile"
-
-
-PANELS = {"show_left_ui": False, "show_right_ui": False}
 
 
 class Keyboard:
@@ -46,39 +40,40 @@ class Keyboard:
             self.command[axis] = min(max(moved, self.low[axis]), self.high[axis])
         elif key == SPACE:
             self.command = [0.0, 0.0, 0.0]
-        elif key == BACKSPACE:
-            self.restart = True
-        elif key == NEXT:
-            self.tile += 1
+        elif key in (BACKSPACE, NEXT):
+            self.tile += key == NEXT
             self.restart = True
 
 
 @torch.inference_mode()
-def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Playground | None = None) -> None:
-    """Show the task's first robot in real time until the window is closed; on terrain, on a tile of the playground."""
-    low, high = task.command_sampler.full_ranges.t().tolist()
+def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> None:
+    """Show the task's first environment in real time until the window is closed; on terrain, on a tile of the playground."""
+    import mujoco.viewer  # needs a library for windows, which a machine without a display may lack
+
+    legged = task if isinstance(task, LeggedRobot) else None
+    low, high = legged.command_sampler.full_ranges.t().tolist() if legged else ([0.0] * 3, [0.0] * 3)
     keyboard = Keyboard(low, high)
-    model = display_model(task.robot, 1, 640, 480, task.terrain)
-    data = mujoco.MjData(model)
-    length = size_of(task.robot).longest
-    simulated = mujoco.MjData(task.physics.model)
-    print(HELP)
+    model = display_model(legged.robot, 1, 640, 480, legged.terrain) if legged else drawn_model(task, 640, 480)
+    data, simulated = mujoco.MjData(model), mujoco.MjData(task.physics.model)
+    print(HELP if legged else HELP_WITHOUT_COMMANDS)
     if playground:
-        print(HELP_ON_TERRAIN)
-    begin_anew(task, playground, keyboard)
-    with _window(model, data, keyboard.press) as window:
-        window.cam.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        window.cam.trackbodyid = model.body(f"0/{task.robot.file.base}").id
-        window.cam.distance, window.cam.azimuth, window.cam.elevation = (
-            (2.4 * length, 130.0, -18.0) if task.terrain is None else (3.83 * length, 62.0, -35.0)
-        )
-        window.opt.geomgroup[3] = 0  # collision shapes
+        print("n goes to the next tile")
+    observations = begin_anew(task, playground, keyboard)
+    panels = {"show_left_ui": False, "show_right_ui": False}
+    with mujoco.viewer.launch_passive(model, data, key_callback=keyboard.press, **panels) as window:
+        follow_root(window.cam, model)
+        if legged:
+            window.cam.trackbodyid = model.body(f"0/{legged.robot.file.base}").id
+            away, window.cam.azimuth, window.cam.elevation = (2.4, 130, -18) if legged.terrain is None else (3.83, 62, -35)
+            window.cam.distance = away * size_of(legged.robot).max()
+            window.opt.geomgroup[3] = 0  # collision shapes
         while window.is_running():
             begin = time.perf_counter()
             if keyboard.restart:
-                begin_anew(task, playground, keyboard)
-            command = torch.tensor(keyboard.command, device=task.device)  # type: ignore[arg-type]
-            task.step(act(task.hold_commands(command)))
+                observations = begin_anew(task, playground, keyboard)
+            if legged:
+                observations = legged.hold_commands(task.physics.qpos.new_tensor(keyboard.command))
+            observations, _, _, _ = task.step(act(observations))
             with window.lock():
                 task.physics.copy_to(0, simulated)
                 data.qpos[:], data.qvel[:] = simulated.qpos, simulated.qvel
@@ -87,46 +82,12 @@ def view(task: LeggedRobot, act: Callable[[TensorDict], Tensor], playground: Pla
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
 
 
-@torch.inference_mode()
-def watch(task: BaseTask, act: Callable[[TensorDict], Tensor]) -> None:
-    """Show the first environment of a task without commands in real time until the window is closed."""
-    model = drawn_model(task, 640, 480)
-    data = mujoco.MjData(model)
-    restart: list[int] = []
-    print(HELP_WITHOUT_COMMANDS)
-    observations = task.reset()
-
-    def press(key: int) -> None:
-        if key == BACKSPACE:
-            restart.append(key)
-
-    with _window(model, data, press) as window:
-        follow_root(window.cam, model)
-        while window.is_running():
-            begin = time.perf_counter()
-            if restart:
-                restart.clear()
-                observations = task.reset()
-            observations, _, _, _ = task.step(act(observations))
-            with window.lock():
-                task.physics.copy_to(0, data)
-                mujoco.mj_forward(model, data)
-            window.sync()
-            time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
-
-
-def _window(model: mujoco.MjModel, data: mujoco.MjData, press: Callable[[int], None]) -> Any:
-    """Open MuJoCo's viewer, whose library for windows a machine without a display may lack."""
-    import mujoco.viewer
-
-    return mujoco.viewer.launch_passive(model, data, key_callback=press, **PANELS)
-
-
-def begin_anew(task: LeggedRobot, playground: Playground | None, keyboard: Keyboard) -> None:
-    """Reset the robots, on terrain on the tile that the keyboard selects, and print its name."""
-    if playground and task.terrain:
+def begin_anew(task: BaseTask, playground: Playground | None, keyboard: Keyboard) -> TensorDict:
+    """Reset the task, on terrain on the tile that the keyboard selects, and print its name; return the observations."""
+    if playground and isinstance(task, LeggedRobot):
         playground.place(task, keyboard.tile)
-    task.reset()
+    observations = task.reset()
     keyboard.restart = False
-    if playground and task.terrain:
+    if playground and isinstance(task, LeggedRobot) and task.terrain:
         print(playground.label(task.terrain, task.base_pos[0].tolist()))
+    return observations

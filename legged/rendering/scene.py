@@ -3,10 +3,9 @@
 Terrain is coloured by its height, so that steps show without shadows.
 """
 
-from collections.abc import Sequence
-
 import mujoco
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from legged.physics.scene.terrain_geoms import SAME, add_terrain
 from legged.robots.importing.convert import robot_spec_of
@@ -44,19 +43,24 @@ def add_sky(scene: mujoco.MjSpec) -> None:
 def display_model(robot: Robot, count: int, width: int, height: int, terrain: Terrain | None = None) -> mujoco.MjModel:
     """Return a model of `count` copies of a robot over a checkered floor or a terrain, for pictures of that size [pixels]."""
     scene = mujoco.MjSpec()
-    scene.visual.global_.offwidth, scene.visual.global_.offheight = width, height
-    scene.visual.quality.shadowsize = scene.visual.quality.offsamples = 0  # ten times faster without a GPU
-    scene.visual.map.zfar = 60
+    look = scene.visual
+    look.global_.offwidth, look.global_.offheight = width, height
+    look.quality.shadowsize = look.quality.offsamples = 0  # ten times faster without a GPU
+    look.map.zfar = 60
     scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
     add_sky(scene)
     if terrain is None:
-        _add_floor(scene)
-        _light(scene, [-0.3, 0.35, -1], ambient=0.45, headlight=0.5, sun=0.5)
+        add_checker(scene, "ground", [0.80, 0.82, 0.84], [0.70, 0.73, 0.76], 512).texrepeat = [1, 1]
+        scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground")
+        sunlight, ambient, headlight, sun = [-0.3, 0.35, -1], 0.45, 0.5, 0.5
     else:
         add_painted_terrain(scene, terrain, checkered=True)
         add_horizon(scene, terrain)
         # Most light comes from the left behind the camera, so that treads, risers and flanks differ in brightness.
-        _light(scene, [0.3, -0.35, -0.9], ambient=0.42, headlight=0.12, sun=0.62)
+        sunlight, ambient, headlight, sun = [0.3, -0.35, -0.9], 0.42, 0.12, 0.62
+    look.headlight.ambient, look.headlight.diffuse = [ambient] * 3, [headlight] * 3
+    kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    scene.worldbody.add_light(pos=[0, 0, 20], dir=sunlight, type=kind, diffuse=[sun] * 3)
     add_robots(scene, robot, count)
     return scene.compile()
 
@@ -68,26 +72,13 @@ def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
         scene.attach(robot_spec_of(robot.model_path, drawn=True), prefix=f"{i}/", frame=frame)
 
 
-def _add_floor(scene: mujoco.MjSpec) -> None:
-    """Add a checkered plane."""
-    scene.add_texture(
-        name="checker",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.80, 0.82, 0.84],
-        rgb2=[0.70, 0.73, 0.76],
-        width=512,
-        height=512,
-    )
-    ground = scene.add_material(name="ground", texrepeat=[1, 1], texuniform=True)
-    ground.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
-    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], material="ground")
-
-
-def _light(scene: mujoco.MjSpec, direction: Sequence[float], ambient: float, headlight: float, sun: float) -> None:
-    """Add a sun that shines in a direction, and a headlight at the camera."""
-    scene.visual.headlight.ambient, scene.visual.headlight.diffuse = [ambient] * 3, [headlight] * 3
-    scene.worldbody.add_light(pos=[0, 0, 20], dir=direction, type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, diffuse=[sun] * 3)
+def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[float], side: int) -> mujoco.MjsMaterial:
+    """Return a new material of squares of two colours, whose texture is `side` pixels wide."""
+    kind, builtin = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
+    scene.add_texture(name=name, type=kind, builtin=builtin, rgb1=one, rgb2=other, width=side, height=side)
+    material = scene.add_material(name=name, texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
+    return material
 
 
 def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool = False) -> None:
@@ -97,11 +88,8 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
     span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
     if checkered:
         dark, light = ([grey] * 3 for grey in CHECKER)
-        builtin = mujoco.mjtBuiltin.mjBUILTIN_CHECKER
-        kind = mujoco.mjtTexture.mjTEXTURE_2D
-        scene.add_texture(name=GROUND, type=kind, builtin=builtin, rgb1=dark, rgb2=light, width=256, height=256)
-        material = scene.add_material(name=GROUND, specular=0.0, texuniform=True, texrepeat=[0.5 / SQUARE, 0.5 / SQUARE])
-        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND
+        material = add_checker(scene, GROUND, dark, light, 256)
+        material.specular, material.texrepeat = 0.0, [0.5 / SQUARE, 0.5 / SQUARE]
         span = max(span, float(np.abs(terrain.height_map.corners).max()))
     for geom in add_terrain(scene, terrain, collide=False, depth=SHOWN_DEPTH):
         _paint(scene, geom, span, lowest, terrain.height_map.cell if checkered else None)
@@ -112,20 +100,13 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
     x, y = (0.5 * side for side in terrain.height_map.size)
     far = max(FAR, 1.2 * x, 1.2 * y)
     half = 0.5 * (far - x), 0.5 * (far - y)
+    box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": [*MIDDLE, 1.0], "material": GROUND, "contype": 0, "conaffinity": 0}
     for sign in (-1.0, 1.0):
         for place, size in (
             ((sign * (x + half[0]), 0.0), (half[0], far)),
             ((0.0, sign * (y + half[1])), (x, half[1])),
         ):
-            scene.worldbody.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                pos=[*place, -0.5 * SHOWN_DEPTH],
-                size=[*size, 0.5 * SHOWN_DEPTH],
-                rgba=[*MIDDLE, 1.0],
-                material=GROUND,
-                contype=0,
-                conaffinity=0,
-            )
+            scene.worldbody.add_geom(pos=[*place, -0.5 * SHOWN_DEPTH], size=[*size, 0.5 * SHOWN_DEPTH], **box)
 
 
 def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
@@ -144,15 +125,8 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: floa
     if cell is not None:
         rows, columns = (np.arange(n) * cell // SQUARE for n in heights.shape)
         colors = colors * np.where((rows[:, None] + columns) % 2 > 0, *CHECKER)[:, :, None]
-    pixels = (255 * colors).astype(np.uint8)
-    scene.add_texture(
-        name=geom.name,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        width=shape.ncol,
-        height=shape.nrow,
-        nchannel=3,
-        data=pixels.ravel().tolist(),
-    )
+    kind, pixels = mujoco.mjtTexture.mjTEXTURE_2D, (255 * colors).astype(np.uint8).ravel().tolist()
+    scene.add_texture(name=geom.name, type=kind, width=shape.ncol, height=shape.nrow, nchannel=3, data=pixels)
     material = scene.add_material(name=geom.name, specular=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = geom.name
     geom.material = geom.name
@@ -166,10 +140,7 @@ def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
         return heights
     seen = np.pad(~sunk, 1)
     padded = np.where(seen, np.pad(heights, 1), 0.0)
-    x, y = heights.shape
-    around = [(slice(i, i + x), slice(j, j + y)) for i in range(3) for j in range(3)]
-    count = sum(seen[at].astype(int) for at in around)
-    total = sum(padded[at] for at in around)
+    count, total = (sliding_window_view(values, (3, 3)).sum(axis=(2, 3)) for values in (seen, padded))
     beside = np.where(count > 0, total / np.maximum(count, 1), heights[~sunk].mean())
     return np.where(sunk, beside, heights)
 

@@ -1,7 +1,8 @@
 """Pictures of terrain: tiles with a robot for scale, and a map of the heights."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -10,8 +11,7 @@ import numpy as np
 from legged.config import LeggedConfig
 from legged.config.schema import TerrainConfig
 from legged.figures import figure, import_matplotlib
-from legged.rendering.camera import Camera, labels
-from legged.rendering.framing import frame
+from legged.rendering.camera import Camera, frame, labels
 from legged.rendering.scene import SHOWN_DEPTH, add_painted_terrain, add_robots, add_sky
 from legged.robots.robot import Robot, load_robot
 from legged.robots.stance import lowest_point
@@ -19,6 +19,8 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, tile_size
 
 MARGIN = 2.0
 """Width of the visible border around the tiles [m]."""
+WIDTH = 1600
+"""Width of a picture; its height is that of the terrain in it [pixels]."""
 AZIMUTH, ELEVATION = 14.0, -35.0
 """The camera looks along x and down, a little from the side [degrees]."""
 FILLED = 0.96
@@ -29,15 +31,6 @@ FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera [degrees]."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """A tile with a robot and a label."""
-
-    row: int
-    col: int
-    label: str
-
-
 def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, seed: int) -> Terrain:
     """Return a terrain of the given types (R, C), all equally difficult, with a narrow border."""
     specs = [[TileSpec(name, tile_size(cfg, name, difficulty)) for name in row] for row in rows]
@@ -45,7 +38,8 @@ def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, 
 
 
 def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 of one labelled tile per type, row by row from the upper left corner.
+    """Return a picture (height, width, 3) uint8 of one labelled tile per type, with a robot on each, row by row from the
+    upper left corner.
 
     Raises:
         RunError: this machine cannot render.
@@ -54,55 +48,40 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
     columns = count if count <= 3 else -(-count // 2) if count <= 8 else 4
     rows = -(-count // columns)
     # The camera looks along x: the first row is the farthest, the first column the leftmost.
-    at = [(rows - 1 - i // columns, columns - 1 - i % columns) for i in range(count)]
-    names = [["flat"] * columns for _ in range(rows)]
-    for name, (r, c) in zip(types, at, strict=True):
-        names[r][c] = name
-    terrain = tiles(cfg.terrain, names, difficulty, cfg.env.seed)
-    places = []
-    for name, (r, c) in zip(types, at, strict=True):
-        kind = TERRAIN_TYPES[name]
-        places.append(
-            Place(r, c, name if name == "flat" else f"{name}, {kind.text(tile_size(cfg.terrain, name, difficulty))}")
-        )
-    return render(terrain, places, load_robot(cfg.robot))
+    places = {(rows - 1 - i // columns, columns - 1 - i % columns): name for i, name in enumerate(types)}
+    names = [[places.get((r, c), "flat") for c in range(columns)] for r in range(rows)]
+    terrain, robot = tiles(cfg.terrain, names, difficulty, cfg.env.seed), load_robot(cfg.robot)
+    sizes = {name: TERRAIN_TYPES[name].text(tile_size(cfg.terrain, name, difficulty)) for name in types}
+    texts = [name if name == "flat" else f"{name}, {sizes[name]}" for name in types]
 
-
-def render(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int = 1600) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 of a terrain along x from above, with a robot at each place.
-
-    The height of the picture is that of the terrain in it.
-
-    Raises:
-        RunError: this machine cannot render.
-    """
-    outline = _outline(terrain)
+    x, y = (0.5 * side for side in terrain.height_map.size)
+    bottom = float(terrain.height_map.corners.min()) - SHOWN_DEPTH
+    outline = np.array(list(product((-x, x), (-y, y), (bottom, 0.5))))
     reach = FILLED * float(np.tan(0.5 * np.radians(FIELD_OF_VIEW)))
     _, _, (across, up) = frame(outline, (reach, reach), AZIMUTH, ELEVATION)
-    height = int(width * np.clip(up / across, 0.3, 0.8))
-    camera = Camera(_model(terrain, places, robot, width, height), width, height)
-    view = camera.view
-    view.azimuth, view.elevation = AZIMUTH, ELEVATION
-    view.lookat[:], view.distance, _ = frame(outline, (reach * width / height, reach), AZIMUTH, ELEVATION)
-    _pose(camera.model, camera.data, terrain, places, robot)
+    height = int(WIDTH * np.clip(up / across, 0.3, 0.8))
+    camera = Camera(_model(terrain, robot, count, height), WIDTH, height)
     try:
+        camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
+        shape = (reach * WIDTH / height, reach)
+        camera.view.lookat[:], camera.view.distance, _ = frame(outline, shape, AZIMUTH, ELEVATION)
+        _pose(camera.model, camera.data, terrain.origins[tuple(zip(*places, strict=True))], robot)
         camera.update()
-        at = camera.pixels(np.array([_label_at(terrain, place) for place in places]))
-        return labels(camera.render(), [place.label for place in places], at)
+        at = camera.pixels(np.array([_label_at(terrain, *place) for place in places]))
+        return labels(camera.render(), texts, at)
     finally:
         camera.close()
 
 
-def _model(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int, height: int) -> mujoco.MjModel:
-    """Return the scene, with the robots in the order of `places`."""
+def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.MjModel:
+    """Return the scene of a terrain and copies of a robot, for pictures of that height [pixels]."""
     scene = mujoco.MjSpec()
     add_sky(scene)
-    half_x, half_y = (0.5 * side for side in terrain.height_map.size)
     look = scene.visual
-    look.global_.offwidth, look.global_.offheight, look.global_.fovy = width, height, FIELD_OF_VIEW
+    look.global_.offwidth, look.global_.offheight, look.global_.fovy = WIDTH, height, FIELD_OF_VIEW
     look.quality.shadowsize, look.quality.offsamples = 8192, 8
     look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = [0.42] * 3, [0.12] * 3, [0.0] * 3
-    extent = float(np.hypot(half_x, half_y))
+    extent = float(np.hypot(*(0.5 * side for side in terrain.height_map.size)))
     scene.stat.extent, scene.stat.center = extent, [0, 0, 0]
     look.map.znear, look.map.zfar, look.map.shadowclip = 0.2, 6.0, 1.2
     scene.worldbody.add_light(
@@ -114,38 +93,28 @@ def _model(terrain: Terrain, places: Sequence[Place], robot: Robot, width: int, 
         castshadow=True,
     )
     add_painted_terrain(scene, terrain)
-    add_robots(scene, robot, len(places))
+    add_robots(scene, robot, count)
     return scene.compile()
 
 
-def _pose(model: mujoco.MjModel, data: mujoco.MjData, terrain: Terrain, places: Sequence[Place], robot: Robot) -> None:
-    """Put each robot on the middle of its tile, its lowest foot on the ground, facing the camera."""
-    states = data.qpos.reshape(len(places), len(robot.default_qpos))
+def _pose(model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, robot: Robot) -> None:
+    """Put each robot on the middle of its tile (N, 3), its lowest foot on the ground, facing the camera."""
+    states = data.qpos.reshape(len(origins), len(robot.default_qpos))
     states[:] = robot.default_qpos
-    for i, place in enumerate(places):
-        states[i, :3] = terrain.origins[place.row, place.col]
-        states[i, 3:7] = [np.cos(np.radians(110.0)), 0.0, 0.0, np.sin(np.radians(110.0))]
+    states[:, :3] = origins
+    states[:, 3:7] = [np.cos(np.radians(110.0)), 0.0, 0.0, np.sin(np.radians(110.0))]
     mujoco.mj_kinematics(model, data)
-    for i in range(len(places)):
+    for i, origin in enumerate(origins):
         feet = [model.geom(f"{i}/{name}").id for shapes in robot.feet_shapes for name in shapes]
-        low = min(lowest_point(model, data, foot) for foot in feet)
-        states[i, 2] += terrain.origins[places[i].row, places[i].col, 2] - low
+        states[i, 2] += origin[2] - min(lowest_point(model, data, foot) for foot in feet)
 
 
-def _outline(terrain: Terrain) -> np.ndarray:
-    """Return the corners (8, 3) of the box around the tiles and the robots on them [m]."""
-    x, y = (0.5 * side for side in terrain.height_map.size)
-    bottom = float(terrain.height_map.corners.min()) - SHOWN_DEPTH
-    return np.array([[sx * x, sy * y, z] for sx in (-1, 1) for sy in (-1, 1) for z in (bottom, 0.5)])
-
-
-def _label_at(terrain: Terrain, place: Place) -> np.ndarray:
-    """Return the position (3,) of a label: behind the farthest tiles, and on the near edge of the others [m]."""
-    x, y, _ = terrain.origins[place.row, place.col]
-    last = len(terrain.origins) - 1
-    if place.row == last > 0:
+def _label_at(terrain: Terrain, row: int, col: int) -> np.ndarray:
+    """Return the position (3,) of a tile's label: behind the farthest tiles, and on the near edge of the others [m]."""
+    x, y, _ = terrain.origins[row, col]
+    if row == len(terrain.origins) - 1 > 0:
         return np.array([x + 0.5 * (terrain.tile_size[0] + terrain.border), y, 0.0])
-    aside = 0.5 * terrain.border if place.row == 0 else 0.0
+    aside = 0.5 * terrain.border if row == 0 else 0.0
     return np.array([x - 0.5 * terrain.tile_size[0] - aside, y, 0.0])
 
 
@@ -169,7 +138,6 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     light = LightSource(azdeg=315, altdeg=45)
     shaded = light.shade(heights, colors, blend_mode="soft", norm=scale, vert_exag=2.0, dx=ground.cell, dy=ground.cell)
     half_x, half_y = (0.5 * n * ground.cell for n in heights.shape)
-
     across = 11.0
     high = min(max(across * half_x / half_y, 2.0), 12.0) + 1.2
     with figure(path, (across, high), dpi=130, bbox_inches="tight") as (drawn, axes):
@@ -178,12 +146,9 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
         ends_x, ends_y = (np.arange(n + 1) * s - 0.5 * n * s for n, s in ((rows, length), (columns, width)))
         axis.hlines(ends_x, ends_y[0], ends_y[-1], color="black", linewidth=0.5, alpha=0.5)
         axis.vlines(ends_y, ends_x[0], ends_x[-1], color="black", linewidth=0.5, alpha=0.5)
-        axis.plot(
-            terrain.origins[..., 1].ravel(), terrain.origins[..., 0].ravel(), "k+", markersize=4, label="robots start here"
-        )
-        axis.set_xlabel("y [m]")
-        axis.set_ylabel("x [m]")
-
+        x, y, _ = terrain.origins.reshape(-1, 3).T
+        axis.plot(y, x, "k+", markersize=4, label="robots start here")
+        axis.set(xlabel="y [m]", ylabel="x [m]")
         top = axis.secondary_xaxis("top")
         groups = [[c for c in range(columns) if terrain.types[c] == name] for name in dict.fromkeys(terrain.types)]
         middles = [0.5 * (ends_y[group[0]] + ends_y[group[-1] + 1]) for group in groups]

@@ -11,7 +11,7 @@ from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders
 from legged.cli import play, train, watch
 from legged.commandline.arguments import watch_command
 from legged.errors import ConfigError
-from legged.play.live.address import HOST, PORT, free_port, is_loopback, url
+from legged.play.live.page import HOST, PORT, free_port, is_loopback, url
 
 pytestmark = pytest.mark.usefixtures("workplace")
 

@@ -11,10 +11,8 @@ from handmade import made_by_hand
 from helpers import small_config
 
 from legged.cli.episodes.common import LIST
-from legged.episodes.page import page_name
-from legged.episodes.parquet import TABLE
-from legged.episodes.statistics_report import NAME
-from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, load_config, load_episodes, save_episodes
+from legged.episodes.joint_statistics import NAME
+from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, TABLE, load_config, load_episodes, save_episodes
 from legged.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -60,7 +58,7 @@ def test_numbers_are_never_described_by_an_earlier_recording(full, monkeypatch):
 
 def test_a_recording_takes_away_what_was_made_of_the_one_before_it():
     folder = saved()
-    made = [page_name(3), page_name(1000), f"{NAME}.md", f"{NAME}.html", f"{NAME}.png", LIST, TABLE]
+    made = ["episode_003.html", "episode_1000.html", f"{NAME}.md", f"{NAME}.html", f"{NAME}.png", LIST, TABLE]
     own = ["notes.md", "episode_best.html"]
     for name in made + own:
         (folder / name).write_text(name)
@@ -100,9 +98,9 @@ def replace_array(name: str, array: np.ndarray):
         (change(format=99), "format: expected 1, got int '99'"),
         (change(arrays={}), r"arrays\.\w+: expected a mapping, got nothing"),
         (change(dt=0.0), "dt: expected a number above 0"),
-        (change(joints=[]), r"joints: expected \(4,\) of them, as joint_pos has"),
+        (change(joints=[]), r"joint_pos: expected rows of shape \(0,\), got \(4,\)"),
         (change(feet=["one"]), r"feet_pos: expected rows of shape \(1, 3\), got \(2, 3\)"),
-        (change(terminations=["one"]), "terminations: expected"),
+        (change(terminations=["one"]), r"ended_by: expected rows of shape \(1,\), got \(2,\)"),
         (replace_array("torque", np.zeros((7, 4))), "torque: expected 8 rows of numbers, got shape"),
         (replace_array("torque", np.full((8, 4), "x")), "torque: expected 8 rows of numbers"),
         (replace_array("qvel", np.zeros((8, 3))), r"arrays\.qvel\.columns: expected names"),

@@ -9,13 +9,13 @@ import torch
 from helpers import ENGINE, POLICY, small_task
 from PIL import Image
 
-from legged.episodes import film
-from legged.episodes.film import Projector
-from legged.episodes.rollout import Wish, roll_out
+from legged.episodes import page
+from legged.episodes.page import Projector
+from legged.episodes.recorder import Wish, roll_out
 from legged.errors import RunError
 from legged.policies.restore import policy_of
 from legged.registry import task_config
-from legged.rendering import display_model
+from legged.rendering.scene import display_model
 from legged.terrain import TERRAIN_TYPES, Terrain
 
 SHORT = (("env.episode_length_s", 0.4), ("sim.threads", 1))
@@ -71,18 +71,18 @@ def test_pictures_are_so_coarse_that_they_fit(share, monkeypatch):
 
         def close(self): ...
 
-    monkeypatch.setattr(film, "camera_of", Noise)
+    monkeypatch.setattr(page, "camera_of", Noise)
     episodes, cfg = roll_out(policy_of(str(POLICY)), Wish(1, 1, changes=SHORT), torch.device("cpu"))
     projector = Projector(episodes, cfg)
     assert task.dt == pytest.approx(0.02)
     fine = projector.show(0)
     assert (fine["every"], len(fine["pictures"])) == (2, 10)  # 25 a second
     size = len(base64.b64decode("".join(fine["pictures"][:1]))) * 10
-    monkeypatch.setattr(film, "BUDGET_MB", share * size / 1e6)
+    monkeypatch.setattr(page, "BUDGET_MB", share * size / 1e6)
     coarse = projector.show(0)["pictures"]
     assert sum(len(base64.b64decode(picture)) for picture in coarse) <= share * size
     assert Image.open(io.BytesIO(base64.b64decode(coarse[0]))).size == (64, 36)
-    monkeypatch.setattr(film, "MOST_PICTURES", 3)
+    monkeypatch.setattr(page, "MOST_PICTURES", 3)
     assert len(projector.show(0)["pictures"]) == 3
 
 
@@ -97,7 +97,7 @@ def test_ground_that_is_larger_than_the_horizon_is_drawn():
 
 
 def test_an_episode_is_drawn_where_pictures_can_be_made(monkeypatch):
-    monkeypatch.setattr(film, "MOST_PICTURES", 2)
+    monkeypatch.setattr(page, "MOST_PICTURES", 2)
     episodes, cfg = roll_out(policy_of(str(POLICY)), Wish(1, 1, changes=SHORT), torch.device("cpu"))
     projector = Projector(episodes, cfg)
     try:
@@ -105,7 +105,7 @@ def test_an_episode_is_drawn_where_pictures_can_be_made(monkeypatch):
     except RunError as error:
         pytest.skip(str(error))
     first, last = (np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))), dtype=int) for picture in found)
-    assert first.shape == (film.HEIGHT, film.WIDTH, 3)
+    assert first.shape == (page.HEIGHT, page.WIDTH, 3)
     assert np.abs(first - last).max() > 50  # the robot has moved
     red = (first[:, :, 0] > 140) & (first[:, :, 1] < 60)
     assert red.sum() > 1000  # ANYmal C is red, and near

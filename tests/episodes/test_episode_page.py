@@ -4,7 +4,6 @@ import base64
 import io
 import shutil
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,13 +59,13 @@ def opened(browser, tmp_path):
         episodes["base_lin_vel"][episodes.rows(1), 0] = steps
         episodes["feet_contact"][episodes.rows(1), 0] = (steps // 10) % 2
         episodes["reward_parts"][episodes.rows(1)] = [0.02, -0.01]
-        path = write_page(tmp_path, episodes, figures_of(episodes), 1, film)
+        write_page(tmp_path, episodes, figures_of(episodes), 1, film)
         page = browser.new_page(viewport={"width": width, "height": 900})
         page.set_default_timeout(1000.0 * HANG_S)
         page.on("console", lambda message: said.append(message.text))
         page.on("pageerror", lambda error: said.append(str(error)))
         page.on("request", lambda request: asked.append(request.url))
-        page.goto(Path(path).as_uri())
+        page.goto((tmp_path / "episode_001.html").as_uri())
         wait(page, "episode.state().picture === 0")
         return page
 

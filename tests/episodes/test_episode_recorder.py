@@ -10,9 +10,7 @@ from helpers import CALM, ENGINE, JOINTS, POLICY, small_task, stand
 from legged.envs import LeggedRobot
 from legged.envs.final_observation import keep_final_step
 from legged.episodes import recorder
-from legged.episodes.quantities import joints_of, quantities_of
-from legged.episodes.recorder import record_episodes, shares_of
-from legged.episodes.rollout import Wish, roll_out, spread
+from legged.episodes.recorder import Wish, joints_of, quantities_of, record_episodes, roll_out, shares_of, spread
 from legged.episodes.stored import TIME_UP
 from legged.policies.restore import policy_of
 from legged.registry import make_task, register, task_config
@@ -127,13 +125,13 @@ def test_robots_are_spread_over_all_levels_and_stay_there():
 def test_joints_of_every_kind_of_robot_are_found():
     cassie = make_task(task_config("cassie_flat", [("env.num_envs", 1), *ENGINE], on_cpu=True))
     names = cassie.robot.joint_names
-    assert [joint.name for joint in joints_of(cassie)] == list(names)
+    assert [joint["name"] for joint in joints_of(cassie)] == list(names)
     qpos = next(quantity for quantity in quantities_of(cassie) if quantity.name == "qpos")
     assert len(qpos.columns) == cassie.physics.model.nq > 7 + len(names)  # passive joints lie between
     for joint in joints_of(cassie):
-        assert qpos.columns[joint.qpos].endswith(joint.name)
+        assert qpos.columns[joint["qpos"]].endswith(joint["name"])
     cheetah = make_task(task_config("half_cheetah", [("env.num_envs", 1), *ENGINE], on_cpu=True))
-    found = {joint.name: joint.max_torque for joint in joints_of(cheetah)}
+    found = {joint["name"]: joint["max_torque"] for joint in joints_of(cheetah)}
     # Gears of Gymnasium's half_cheetah.xml, at controls up to 1.
     assert found == {"bthigh": 120.0, "bshin": 90.0, "bfoot": 60.0, "fthigh": 120.0, "fshin": 60.0, "ffoot": 30.0}
 
@@ -141,7 +139,7 @@ def test_joints_of_every_kind_of_robot_are_found():
 def test_limits_are_the_robots_own_where_gains_and_limits_are_drawn():
     drawn = {"p_gain": [0.9, 1.1], "torque_limit": [0.8, 1.1], "joint_offset": [-0.02, 0.02]}
     joints = joints_of(small_task(("domain_rand.ranges", drawn)))
-    assert [joint.max_torque for joint in joints] == [80.0] * JOINTS
+    assert [joint["max_torque"] for joint in joints] == [80.0] * JOINTS
 
 
 def test_torques_of_motors_are_their_controls_times_the_gear():

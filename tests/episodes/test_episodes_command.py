@@ -9,7 +9,6 @@ import pytest
 from helpers import POLICY, TASK, call, tiny_run
 
 from legged.cli.episodes import compare, record, statistics, stored
-from legged.episodes import film
 from legged.episodes.stored import ABOUT, ARRAYS
 from legged.errors import RunError
 from legged.policies import restore
@@ -74,7 +73,7 @@ def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsy
     def fail(*_):
         raise RunError("cannot render here")
 
-    monkeypatch.setattr(film, "camera_of", fail)
+    monkeypatch.setattr("legged.episodes.page.camera_of", fail)
     assert call(record.main, [*HERE, "--out", "out", "--worst", "1"]) == 0
     (page,) = Path("out").glob("episode_*.html")
     text = page.read_text()
@@ -91,7 +90,7 @@ def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsy
 
 
 def test_other_tasks_show_what_they_have(capsys, monkeypatch):
-    monkeypatch.setattr(film, "MOST_PICTURES", 4)
+    monkeypatch.setattr("legged.episodes.page.MOST_PICTURES", 4)
     policy = POLICY.parent / "half_cheetah"
     few = [str(policy), *FEW, "env.episode_length_s=1"]
     assert call(record.main, [*few, "--out", "out", "--page", "0"]) == 0
@@ -122,7 +121,7 @@ def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
 
 
 def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
-    monkeypatch.setattr("legged.episodes.parquet.find_spec", lambda _: None)
+    monkeypatch.setattr("legged.cli.episodes.common.find_spec", lambda _: None)
     assert call(record.main, [*HERE, "--parquet"]) == 2
     assert capsys.readouterr().err == (
         "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"

@@ -13,10 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from legged.cli.episodes import record, stored
-from legged.episodes.joint_statistics import joint_statistics
-from legged.episodes.panels import Panels
+from legged.episodes.joint_statistics import joint_statistics, tables_of
+from legged.episodes.page import Panels
 from legged.episodes.ranking import figures_of
-from legged.episodes.statistics_report import tables_of
 from legged.episodes.stored import ABOUT, ARRAYS, load_episodes
 from legged.errors import ConfigError
 

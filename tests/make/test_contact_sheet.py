@@ -10,7 +10,7 @@ from helpers import POLICY, TASK, call, small_config
 from PIL import Image
 
 from legged import registry
-from legged.play.walking_film import walker
+from legged.play.films import walker
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.registry import task_config
 

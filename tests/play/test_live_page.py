@@ -17,11 +17,8 @@ from helpers import ENGINE, HANG_S, POLICY, POLICY_ITERATION, TASK, until, wait_
 from PIL import Image
 
 from legged.learning.run_folder import run_config
-from legged.play.live.address import HOST, free_port, url
-from legged.play.live.ground import changes_for, check_ground
-from legged.play.live.page import Page
-from legged.play.live.session import Session
-from legged.play.live.source import Watched
+from legged.play.live.page import HOST, Page, free_port, url
+from legged.play.live.session import Session, Watched, changes_for, check_ground
 
 pytest.importorskip("viser", reason="the extra `watch` is not installed")
 
@@ -155,7 +152,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
         window.keyboard.press("n")
         until(lambda: shown.session.time == pytest.approx(before + 0.02))
         browser.close()
-        until(lambda: shown.visitors == 0)
+        until(lambda: not shown.server.get_clients())
     assert not wrong
 
 

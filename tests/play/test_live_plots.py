@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 from helpers import small_task, zero_actions
 
-from legged.play.live.history import KEPT_S, History, Sample
-from legged.play.live.plots import LARGEST, MOST_POINTS, LivePlots, gait_diagram, reward_curves, short_names
+from legged.play.live.plots import KEPT_S, LARGEST, MOST_POINTS, History, LivePlots, gait_diagram, reward_curves
 
 
-def history_of(samples: list[Sample], terms=("speed", "torques"), feet=("LF_FOOT", "RF_FOOT"), dt: float = 0.1) -> History:
+def history_of(
+    samples: list[np.ndarray], terms=("speed", "torques"), feet=("LF_FOOT", "RF_FOOT"), dt: float = 0.1
+) -> History:
     """A history of made-up samples."""
     rewards = SimpleNamespace(names=terms)
     cfg = SimpleNamespace(rewards=SimpleNamespace(times_dt=True))
     history = History(SimpleNamespace(rewards=rewards, cfg=cfg, dt=dt))
     history.feet = feet
-    history._samples = samples
+    history.rows = samples
     return history
 
 
-def sample(time: float, *, contacts=(0.0, 0.0), rewards=(0.0, 0.0), speed: float = 0.0) -> Sample:
-    return Sample(time, np.array([speed, 0.0, 0.0]), np.zeros(3), np.array(contacts), np.array(rewards))
+def sample(time: float, *, contacts=(0.0, 0.0), rewards=(0.0, 0.0), speed: float = 0.0) -> np.ndarray:
+    return np.array([time, speed, *[0.0] * 5, *contacts, *rewards])
 
 
 def test_ten_seconds_are_kept_of_the_robot_that_is_followed():
@@ -32,20 +33,16 @@ def test_ten_seconds_are_kept_of_the_robot_that_is_followed():
     for step in range(3):
         task.step(zero_actions(task))
         history.add(task, 1, 0.02 * step)
-    assert history.times() == pytest.approx([-0.04, -0.02, 0.0])
-    assert history.actual()[:2, -1] == pytest.approx(task.base_lin_vel[1, :2].numpy())
-    assert history.commanded()[:, -1] == pytest.approx(task.commands[1, :3].numpy())
-    assert history.contacts()[:, -1] == pytest.approx(task.contacts.in_contact[1].float().numpy())
-    last = history._samples[-1].rewards
+    assert history.curves()["times"] == pytest.approx([-0.04, -0.02, 0.0])
+    assert history.curves()["actual"][:2, -1] == pytest.approx(task.base_lin_vel[1, :2].numpy())
+    assert history.curves()["commanded"][:, -1] == pytest.approx(task.commands[1, :3].numpy())
+    assert history.curves()["contacts"][:, -1] == pytest.approx(task.contacts.in_contact[1].float().numpy())
+    last = history.rows[-1][11:]
     assert last == pytest.approx((task.rewards.last[:, 1] / task.dt).numpy())
     assert last.sum() * task.dt == pytest.approx(float(task.rew_buf[1]), abs=1e-6)
-    for step in range(600):
-        history._samples.append(history._samples[-1])
-        if step % 100 == 0:
-            history.add(task, 1, 0.0)
-    assert len(history) <= KEPT_S / task.dt + 100
-    history.add(task, 1, 0.0)
-    assert len(history) == KEPT_S / task.dt
+    for _ in range(600):
+        history.add(task, 1, 0.0)
+    assert len(history.rows) == KEPT_S / task.dt
 
 
 def test_an_episode_that_ends_breaks_the_curves():
@@ -54,14 +51,14 @@ def test_an_episode_that_ends_breaks_the_curves():
     for step in range(6):
         task.step(zero_actions(task))
         history.add(task, 0, 0.02 * step)
-    assert np.isnan(history.actual()[0]).tolist() == [False, False, False, True, False, False]
-    assert np.isnan(history.rewards()[0]).tolist() == [False, False, False, True, False, False]
+    assert np.isnan(history.curves()["actual"][0]).tolist() == [False, False, False, True, False, False]
+    assert np.isnan(history.curves()["rewards"][0]).tolist() == [False, False, False, True, False, False]
 
 
 def test_rewards_are_means_over_a_fifth_of_a_second():
     history = history_of([sample(0.1 * k, rewards=(value, 1.0)) for k, value in enumerate((0.0, 4.0, 2.0, 0.0))])
-    assert history.rewards()[0] == pytest.approx([0.0, 2.0, 3.0, 1.0])  # two steps of 0.1 s each
-    assert history.rewards()[1] == pytest.approx([1.0] * 4)
+    assert history.curves()["rewards"][0] == pytest.approx([0.0, 2.0, 3.0, 1.0])  # two steps of 0.1 s each
+    assert history.curves()["rewards"][1] == pytest.approx([1.0] * 4)
 
 
 def test_bars_cover_the_steps_in_which_a_foot_is_on_the_ground():
@@ -131,7 +128,7 @@ def test_reward_curves_have_new_names_when_other_terms_are_the_largest():
     history, gui = history_of([], terms), Gui()
     plots = LivePlots(gui, history, has_commands=False)
     assert [chart.title for chart in gui.charts] == ["forward velocity [m/s]", "reward terms [1/s]"]
-    history._samples = [sample(0.1 * k, rewards=np.arange(9.0)) for k in range(5)]
+    history.rows = [sample(0.1 * k, rewards=np.arange(9.0)) for k in range(5)]
     before = gui.charts[-1].series
     plots.update(history)
     assert [line["label"] for line in gui.charts[-1].series[1:]] == [*terms[3:], "3 others"]
@@ -140,10 +137,3 @@ def test_reward_curves_have_new_names_when_other_terms_are_the_largest():
     same = gui.charts[-1].series
     plots.update(history)
     assert gui.charts[-1].series is same  # a chart whose series are assigned is built anew in the browser
-
-
-def test_names_are_short():
-    assert short_names(("LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT")) == ["LF", "RF", "LH", "RH"]
-    assert short_names(("foot_left", "foot_right")) == ["left", "right"]
-    assert short_names(("FL_calf_contact", "FR_calf_contact")) == ["FL", "FR"]
-    assert short_names(("only",)) == ["only"]

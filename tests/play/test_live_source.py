@@ -10,7 +10,7 @@ from helpers import POLICY, TASK
 from legged import registry
 from legged.errors import ConfigError
 from legged.learning.run_folder import BEST, BEST_MODEL, CONFIG_FILE, SHIPPED_MODEL
-from legged.play.live.source import CheckpointFollower, Watched, find_watched
+from legged.play.live.session import Watched, find_watched
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -78,10 +78,10 @@ def test_wrong_names_are_said_with_the_nearest_one():
 
 def test_a_checkpoint_is_given_once_and_again_when_it_was_written_anew():
     run = begin(f"{TASK}/run", 50, when=100.0)
-    follower = CheckpointFollower(Watched(find_watched(None, None).cfg, run))
+    follower = Watched(find_watched(None, None).cfg, run)
     assert follower.changed() == run / "model_50.pt"
     assert follower.changed() is None
-    follower.forget()
+    follower.shown = None
     assert follower.changed() == run / "model_50.pt"
     shutil.copy(POLICY / SHIPPED_MODEL, run / "model_100.pt")
     assert follower.changed() == run / "model_100.pt"
@@ -102,7 +102,7 @@ def test_the_best_checkpoint_can_be_asked_for_and_is_followed():
     with pytest.raises(ConfigError, match=r"has no model_best\.pt"):
         find_watched(None, "best")
     shutil.copy(POLICY / SHIPPED_MODEL, run / BEST_MODEL)
-    follower = CheckpointFollower(find_watched(None, "best"))
+    follower = find_watched(None, "best")
     assert follower.changed() == run / BEST_MODEL
     os.utime(run / BEST_MODEL, (1.0, 1.0))  # the training has found a better one
     assert follower.changed() == run / BEST_MODEL

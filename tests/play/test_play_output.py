@@ -12,7 +12,7 @@ import legged.policies.restore
 from legged.cli import play
 from legged.envs import LeggedRobot
 from legged.errors import RunError
-from legged.play import demonstrations, video
+from legged.play import demonstrations, films
 from legged.policies.actor import Actor
 from legged.policies.export import export
 from legged.process.paths import DISK_FULL
@@ -37,13 +37,13 @@ class FakeCamera:
 @pytest.fixture
 def short(monkeypatch):
     monkeypatch.setattr(demonstrations, "SCHEDULE", ((0.2, (0.5, 0.0, 0.0)),))
-    monkeypatch.setattr(video, "camera_of", FakeCamera)
+    monkeypatch.setattr(films, "camera_of", FakeCamera)
 
 
 def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
     task = small_task(("control.decimation", 250), num_envs=2)
-    film = video.Video(task, 1, Path("film"))
+    film = films.Video(task, 1, Path("film"))
     table = demonstrations.follow_schedule(task, stand, film)
     assert list(table.columns[1].cells) == ["-"]
     assert film.fps == pytest.approx(1 / task.dt)
@@ -70,7 +70,7 @@ def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, mon
     monkeypatch.setattr(demonstrations, "SCHEDULE", ((3.0, (0.5, 0.0, 0.0)),))
     monkeypatch.setattr(demonstrations, "TrackingErrors", Kept)
     task = Falling(small_config(num_envs=2))
-    demonstrations.follow_schedule(task, stand, video.Video(task, 1, Path("film")))
+    demonstrations.follow_schedule(task, stand, films.Video(task, 1, Path("film")))
     assert kept[0].falls.tolist() == [2.0, 2.0]
     assert kept[0].steps.tolist() == [19.0, 19.0]
 
@@ -83,7 +83,7 @@ def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):
             return subprocess.CompletedProcess(command, 228, b"", b"Error writing trailer: No space left on device\n")
         return real(command, **options)
 
-    monkeypatch.setattr(video.subprocess, "run", run)
+    monkeypatch.setattr(films.subprocess, "run", run)
     assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "following commands" in out
@@ -95,11 +95,11 @@ def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, mo
     def fail(*_):
         raise RunError("cannot render here")
 
-    monkeypatch.setattr(video, "camera_of", fail)
+    monkeypatch.setattr(films, "camera_of", fail)
     assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "following commands" in out
-    assert err == "error: cannot render here\n"
+    assert err == "error: cannot render here, or play with --no-video\n"
 
 
 def test_a_window_that_does_not_open_is_told_and_a_film_is_made(short, monkeypatch, capsys):

@@ -14,7 +14,7 @@ from legged.cli import play
 from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
 from legged.math import yaw_of
-from legged.play import demonstrations, video
+from legged.play import demonstrations, films
 from legged.play.demonstrations import TrackingErrors
 from legged.play.playground import ROWS_NEEDED, SETTING, Playground, label
 from legged.process.paths import data_folder
@@ -164,13 +164,14 @@ def test_robots_start_on_their_tiles_and_face_along_x():
 def test_errors_are_root_mean_squares_of_settled_robots():
     """Robot 0 is 0.3 and 0.4 off, robot 1 has just begun its episode, robot 2 falls and would spoil everything."""
     task = SimpleNamespace(
-        dt=0.02,
+        num_envs=3,
+        device="cpu",
         commands=torch.tensor([[0.7, 0.0, 0.2, 0.0]] * 3),
         base_lin_vel=torch.tensor([[0.4, 0.4, 9.0], [5.0, 5.0, 5.0], [7.0, 7.0, 7.0]]),
         base_ang_vel=torch.tensor([[9.0, 9.0, 0.3], [5.0, 5.0, 5.0], [7.0, 7.0, 7.0]]),
         terminated_buf=torch.tensor([False, False, True]),
     )
-    errors = TrackingErrors(3, torch.device("cpu"))
+    errors = TrackingErrors(task)
     for _ in range(2):
         errors.add(task, torch.tensor([True, False, False]))
     assert errors.row(torch.tensor([True, True, False])) == ("0.500 m/s", "0.100 rad/s", "0")
@@ -190,7 +191,7 @@ def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, h
         seen.append(task.commands.clone())
         return torch.zeros(9, 12)
 
-    table = demonstrations.walk_out(task, act, ground, video.Video(task, 1, None))
+    table = demonstrations.walk_out(task, act, ground, films.Video(task, 1, None))
     assert len(seen) == 2 * 5
     commands = torch.stack(seen)
     torch.testing.assert_close(commands[..., 0], torch.full((10, 9), 0.5))  # what the task was trained on
@@ -219,11 +220,11 @@ class FakeCamera:
 def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch, tmp_path):
     monkeypatch.setattr(demonstrations, "EPISODE_S", 0.08)
     monkeypatch.setattr(demonstrations, "EPISODES", 3)
-    monkeypatch.setattr(video, "camera_of", FakeCamera)
+    monkeypatch.setattr(films, "camera_of", FakeCamera)
     monkeypatch.setattr(FakeCamera, "shots", [])
     ground = playground(config(), difficulty=0.5)
     task = on(ground, config(), num_envs=2)
-    film = video.Video(task, 2, tmp_path)
+    film = films.Video(task, 2, tmp_path)
     demonstrations.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
     film.write()
     up, down = (0, "stairs_up, step height 0.14 m"), (1, "stairs_down, step height 0.14 m")

@@ -8,7 +8,7 @@ from helpers import CALM, ENGINE
 
 from legged.config import override
 from legged.play.playground import SETTING, Playground
-from legged.play.viewer import BACKSPACE, COMMA, DOWN, LEFT, NEXT, RIGHT, SPACE, UP, Keyboard, begin_anew, watch
+from legged.play.viewer import BACKSPACE, COMMA, DOWN, LEFT, NEXT, RIGHT, SPACE, UP, Keyboard, begin_anew, view
 from legged.registry import make_task, task_config
 
 
@@ -106,7 +106,7 @@ def test_a_task_without_commands_is_shown_as_it_is_simulated(monkeypatch):
         return torch.full((2, 6), 0.5)
 
     monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
-    watch(task, act)
+    view(task, act)
     assert lengths == [0, 1, 2, 0, 1]  # it began anew
     assert abs(torch.tensor(windows[0].seen[-1]) - task.physics.qpos[0]).max() < 1e-5
     assert windows[0].cam.trackbodyid == 1

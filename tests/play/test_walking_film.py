@@ -9,10 +9,10 @@ from helpers import TASK, small_task
 from PIL import Image
 
 from legged.errors import RunError
-from legged.play import walking_film
-from legged.play.walking_film import film, write_film
+from legged.play import films
+from legged.play.films import film, write_film
 from legged.policies.restore import policy_of
-from legged.rendering import RobotsCamera
+from legged.rendering.camera import RobotsCamera
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -33,14 +33,14 @@ def test_a_gif_shows_all_in_real_time_and_is_made_smaller_until_it_is_small_enou
     write_film(pictures, Path("large.gif"))
     with Image.open("large.gif") as image:
         assert (image.n_frames, image.size, image.info["duration"]) == (4, (64, 64), 80)
-    monkeypatch.setattr(walking_film, "MOST_BYTES", 4000)
+    monkeypatch.setattr(films, "MOST_BYTES", 4000)
     said = write_film(pictures, Path("small.gif"))
     assert Path("small.gif").stat().st_size <= 4000
     with Image.open("small.gif") as image:
         assert image.n_frames == 4
         assert image.size[0] < 64
         assert f"4 pictures of {image.size[0]} x {image.size[1]} pixels" in said
-    monkeypatch.setattr(walking_film, "MOST_BYTES", 100)
+    monkeypatch.setattr(films, "MOST_BYTES", 100)
     with pytest.raises(RunError, match=r"none.gif: would be larger than 0.0001 MB"):
         write_film(pictures, Path("none.gif"))
     assert not Path("none.gif").exists()
@@ -62,7 +62,7 @@ def test_a_robot_that_is_near_fills_its_picture(width, height):
     camera = RobotsCamera(task, 1, width, height)
     camera.come_near(0.8, 1.0)
     camera.picture()
-    sides = np.array(camera.size.sides)
+    sides = camera.sides
     base = np.array([*camera.data.qpos[:2], 0.5 * sides[2]])
     corners = base + 0.5 * sides * np.array(list(product((-1.0, 1.0), repeat=3)))
     reach = np.ptp(camera.pixels(corners), axis=0) / (width, height)

@@ -16,7 +16,7 @@ from helpers import POLICY
 import legged
 from legged.errors import ConfigError, RunError
 from legged.process import headless
-from legged.rendering import make_renderer
+from legged.rendering.camera import make_renderer
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="displays of Linux")
 
@@ -181,7 +181,7 @@ def test_a_display_that_refuses_opens_no_window_and_pictures_are_drawn_all_the_s
     number = 50_000 + os.getpid() % 10_000
     code = (
         "import legged, mujoco\n"
-        "from legged.rendering import make_renderer, window_opens\n"
+        "from legged.rendering.camera import make_renderer, window_opens\n"
         "print(legged.HEADLESS, window_opens())\n"
         "model = mujoco.MjModel.from_xml_string('<mujoco/>')\n"
         "renderer = make_renderer(model, 64, 48)\n"

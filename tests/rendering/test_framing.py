@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged.rendering import Camera
-from legged.rendering.framing import direction, frame
+from legged.rendering.camera import Camera, direction, frame
 
 WIDTH, HEIGHT, FIELD_OF_VIEW = 400, 300, 30.0
 TANGENT = float(np.tan(np.radians(15.0)))

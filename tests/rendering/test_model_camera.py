@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from legged.registry import make_task, task_config
-from legged.rendering import ModelCamera
+from legged.rendering.camera import ModelCamera
 
 WIDTH, HEIGHT = 320, 180
 

@@ -10,9 +10,8 @@ import torch
 from legged.config import override
 from legged.play.playground import SETTING, Playground
 from legged.registry import make_task, task_config
-from legged.rendering import RobotsCamera, display_model, size_of
-from legged.rendering.framing import BEHIND, CUT, FLATTEST, FRONT, Follower
-from legged.rendering.scene import LOW, MIDDLE
+from legged.rendering.camera import BEHIND, CUT, FLATTEST, FRONT, Follower, RobotsCamera, size_of
+from legged.rendering.scene import LOW, MIDDLE, display_model
 from legged.terrain import HeightMap
 
 WIDTH, HEIGHT = 320, 180
@@ -212,25 +211,30 @@ def level(height: float = 0.0) -> HeightMap:
     return HeightMap.of(np.full((200, 200), height), 0.1, (-10.0, -10.0), np.full((200, 200), np.inf))
 
 
+def follower_over(ground: HeightMap) -> Follower:
+    return Follower(mujoco.MjvCamera(), 3.6, ground)
+
+
 def test_a_follower_converges_without_jumps():
-    follower = Follower(level())
+    follower = follower_over(level())
+    view = follower.view
     follower.update(np.array([0.0, 0.0, 0.5]))
-    np.testing.assert_allclose(follower.lookat, [0.0, 0.0, 0.5])
+    np.testing.assert_allclose(view.lookat, [0.0, 0.0, 0.5])
     target = np.array([0.6, -0.4, 0.8])
-    before = np.array(follower.lookat)
+    before = np.array(view.lookat)
     for _ in range(150):
         follower.update(target)
-        assert np.linalg.norm(follower.lookat - before) < 0.2 * np.linalg.norm(target - [0.0, 0.0, 0.5])
-        before = np.array(follower.lookat)
-    np.testing.assert_allclose(follower.lookat, target, atol=1e-3)
-    assert follower.elevation == FLATTEST
+        assert np.linalg.norm(view.lookat - before) < 0.2 * np.linalg.norm(target - [0.0, 0.0, 0.5])
+        before = np.array(view.lookat)
+    np.testing.assert_allclose(view.lookat, target, atol=1e-3)
+    assert view.elevation == FLATTEST
 
 
 def test_a_follower_cuts_to_a_robot_that_was_put_elsewhere():
-    follower = Follower(level())
+    follower = follower_over(level())
     follower.update(np.zeros(3))
     follower.update(np.array([CUT + 0.1, 0.0, 0.0]))
-    np.testing.assert_allclose(follower.lookat, [CUT + 0.1, 0.0, 0.0])
+    np.testing.assert_allclose(follower.view.lookat, [CUT + 0.1, 0.0, 0.0])
 
 
 def test_a_follower_looks_over_the_rim_of_a_pit():
@@ -238,14 +242,13 @@ def test_a_follower_looks_over_the_rim_of_a_pit():
     heights = np.zeros((200, 200))
     heights[90:110, 90:110] = -1.5
     ground = HeightMap.of(heights, 0.1, (-10.0, -10.0), np.full((200, 200), 0.2))
-    follower = Follower(ground)
+    follower = follower_over(ground)
+    view = follower.view
     follower.update(np.array([0.0, 0.0, -1.0]))
-    steep = follower.elevation
+    steep = view.elevation
     assert steep < FLATTEST - 10.0
     follower.update(np.array([0.3, 0.0, -1.0]))
-    assert abs(follower.elevation - steep) < 3.0
-    view = mujoco.MjvCamera()
-    follower.aim(view)
+    assert abs(view.elevation - steep) < 3.0
     e, a = np.radians([view.elevation, view.azimuth])
     eye = view.lookat - view.distance * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     along = np.linspace(0.3, 1.0, 50)[:, None]
@@ -258,10 +261,10 @@ def test_a_follower_sees_the_faces_of_steps():
     heights = np.zeros((200, 200))
     heights[110:] = 0.3
     heights[:50] = 0.3
-    follower = Follower(HeightMap.of(heights, 0.1, (-10.0, -10.0), np.full((200, 200), 0.2)))
+    follower = follower_over(HeightMap.of(heights, 0.1, (-10.0, -10.0), np.full((200, 200), 0.2)))
     for x, azimuth in ((0.0, BEHIND), (-6.0, FRONT), (-3.0, BEHIND), (4.0, BEHIND)):
         follower.update(np.array([x, 0.0, 0.5]))
-        assert follower.azimuth == azimuth
+        assert follower.view.azimuth == azimuth
 
 
 # ---- robots of other sizes -------------------------------------------------------------------------------------------
@@ -282,17 +285,17 @@ def scaled_robot(robot, tmp_path, factor: float, angle: float = 0.0):
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_a_robot_is_as_large_as_the_box_around_it(robot, tmp_path, factor):
     size = size_of(scaled_robot(robot, tmp_path, factor))
-    assert size.longest == pytest.approx(factor)
-    assert size.height == pytest.approx(0.5 * factor)  # 0.2 of the shell, 0.3 of the leg
+    assert size.max() == pytest.approx(factor)
+    assert size[2] == pytest.approx(0.5 * factor)  # 0.2 of the shell, 0.3 of the leg
     turned = scaled_robot(robot, tmp_path, factor, np.pi / 2)
-    assert size_of(turned).height == pytest.approx(factor * 0.2 + 0.01, abs=0.011)  # the leg points along x
+    assert size_of(turned)[2] == pytest.approx(factor * 0.2 + 0.01, abs=0.011)  # the leg points along x
 
 
 def test_the_camera_comes_nearer_to_smaller_robots(task, camera, monkeypatch):
     assert camera.view.distance == pytest.approx(2.0 + 1.1 * 2**0.5, rel=0.01)  # ANYmal C's
     assert camera.offsets[1, 1] - camera.offsets[0, 1] == pytest.approx(1.9, rel=0.01)
     size = size_of(task.robot)
-    monkeypatch.setattr("legged.rendering.task_cameras.size_of", lambda _: replace(size, longest=0.5 * size.longest))
+    monkeypatch.setattr("legged.rendering.camera.size_of", lambda _: 0.5 * size)
     near = RobotsCamera(task, count=2, width=WIDTH, height=HEIGHT)
     near.close()
     assert near.view.distance == pytest.approx(0.5 * camera.view.distance)
@@ -301,7 +304,7 @@ def test_the_camera_comes_nearer_to_smaller_robots(task, camera, monkeypatch):
 
 def test_feet_have_spots_on_a_plane(task, camera, monkeypatch):
     with_spots = camera.picture().astype(int)
-    monkeypatch.setattr(camera, "_shade_feet", lambda _ground: None)
+    monkeypatch.setattr(camera, "_shade_feet", lambda: None)
     changed = differ(with_spots.astype(np.uint8), without := camera.picture())
     assert 0.0005 < changed.mean() < 0.05
     assert with_spots[changed].mean() < without[changed].mean() - 20  # they are darker than the floor

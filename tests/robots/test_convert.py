@@ -14,7 +14,7 @@ from legged.errors import ConfigError
 from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source
 from legged.registry import make_task, task_config
-from legged.rendering.framing import size_of
+from legged.rendering.camera import size_of
 from legged.rendering.scene import display_model
 from legged.robots.importing.convert import is_plain_file, robot_spec_of
 from legged.robots.importing.infer import make_ready, read_robot
@@ -266,7 +266,7 @@ def test_a_camera_sees_what_is_only_drawn(dog, tmp_path, plain):
         spec = robot_spec_of(robot.model_path, drawn=True)
         robot = dog(spec.to_xml(), model="plain.xml")
     assert is_plain_file(robot.model_path) is plain
-    assert 1.5 + 0.3 < size_of(robot).height < 1.5 + 0.43
+    assert 1.5 + 0.3 < size_of(robot)[2] < 1.5 + 0.43
 
 
 @pytest.mark.parametrize("file", ["toy.urdf", "scene.xml"])

@@ -31,16 +31,15 @@ from legged.deploy.__main__ import add_program_arguments, limits_of
 from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
-from legged.play.video import write_mp4
+from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.registry import import_tasks
-from legged.rendering import Camera, display_model, size_of
-from legged.rendering.camera import caption
-from legged.rendering.framing import Follower
+from legged.rendering.camera import Camera, Follower, caption, size_of
+from legged.rendering.scene import display_model
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
@@ -55,8 +54,6 @@ SIZE = (640, 360)
 """Width and height [pixels]."""
 AWAY = 3.45
 """Distance of the camera, in lengths of the robot."""
-GLIDE = 0.1
-"""Share of the distance to a robot on a plane that the camera covers per picture."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
@@ -233,19 +230,12 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
         print(f"{folder}: the run was too short for a film, so there is none")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
-    away = AWAY * size_of(robot).longest
-    follower = None if terrain is None else Follower(terrain.height_map, away)
-    camera.view.distance, camera.view.azimuth, camera.view.elevation = away, 130.0, -18.0
-    camera.view.lookat[:] = poses[0, 1:4]
+    follower = Follower(camera.view, AWAY * size_of(robot).max(), None if terrain is None else terrain.height_map)
     frames = []
     for time, *qpos in poses:
         camera.data.qpos[:] = qpos
         base = np.array(qpos[:3])
-        if follower is None:
-            camera.view.lookat[:] += GLIDE * (base - camera.view.lookat)
-        else:
-            follower.update(base)
-            follower.aim(camera.view)
+        follower.update(base)
         camera.update()
         place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
         state = log["states"][log["state"][place]]

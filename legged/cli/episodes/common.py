@@ -1,31 +1,19 @@
 """Arguments and work that the sub-commands of `legged episodes` share."""
 
 import argparse
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
 from rich.console import Console
 
 from legged.commandline.arguments import add_build_arguments, pick_device, policy_overrides, settle_on
-from legged.episodes.film import Projector
-from legged.episodes.joint_statistics import JointStatistics
-from legged.episodes.page import write_page
-from legged.episodes.parquet import check_parquet, write_parquet
-from legged.episodes.ranking import (
-    COLUMNS,
-    FELL,
-    Figures,
-    counts_text,
-    figures_of,
-    heads_of,
-    order_of,
-    row_of,
-)
-from legged.episodes.rollout import MOST_EPISODES, Wish
-from legged.episodes.statistics_report import tables_of, write_statistics
-from legged.episodes.stored import Episodes, load_config
+from legged.config import TaskConfig
+from legged.episodes.page import Projector, write_page
+from legged.episodes.ranking import COLUMNS, FELL, counts_text, figures_of, listing, order_of
+from legged.episodes.recorder import MOST_EPISODES, Wish, roll_out
+from legged.episodes.stored import Episodes, load_config, write_parquet
 from legged.errors import ConfigError, suggest
-from legged.evaluation.reports.document import text_of
 from legged.evaluation.tables import markdown_table, screen_table
 from legged.policies.restore import TrainedPolicy
 from legged.process.paths import relative, write_text
@@ -49,8 +37,7 @@ def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_listing_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the list of episodes and their pages."""
-    known = f"{FELL}, {', '.join(column.name for column in COLUMNS)}"
-    parser.add_argument("--sort", default=FELL, help=f"{known}; the worst first")
+    parser.add_argument("--sort", default=FELL, help=f"{', '.join((FELL, *COLUMNS))}; the worst first")
     parser.add_argument("--ended", metavar="TERM", help="only episodes that this termination ended")
     parser.add_argument("--top", type=int, default=TOP, help=f"episodes to list; {TOP} by default")
     parser.add_argument("--page", metavar="IDS", help="episodes to make pages of, by number: 3 or 3,17")
@@ -71,24 +58,17 @@ def wish_of(args: argparse.Namespace) -> Wish:
     robots = args.num_envs if args.num_envs is not None else min(args.episodes, MOST_ROBOTS)
     if robots > args.episodes:
         raise ConfigError(f"--num-envs: {robots} robots have no more than {args.episodes} episodes to run (--episodes)")
-    command = None if args.command is None else _command(args.command)
+    command = None
+    if args.command is not None:
+        try:
+            vx, vy, yaw = (float(part) for part in args.command.split(","))
+        except ValueError:
+            vx = vy = yaw = float("nan")
+        if not all(abs(value) <= 100.0 for value in (vx, vy, yaw)):
+            raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{args.command}'")
+        command = vx, vy, yaw
     changes = tuple(policy_overrides(args))
     return Wish(args.episodes, robots, args.as_trained, command, args.terrain, args.difficulty, changes)
-
-
-def _command(text: str) -> tuple[float, float, float]:
-    """Return vx, vy [m/s] and yaw rate [rad/s].
-
-    Raises:
-        ConfigError: the text is not three numbers.
-    """
-    try:
-        vx, vy, yaw = (float(part) for part in text.split(","))
-    except ValueError:
-        vx = vy = yaw = float("nan")
-    if not all(abs(value) <= 100.0 for value in (vx, vy, yaw)):
-        raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{text}'")
-    return vx, vy, yaw
 
 
 def check_listing(args: argparse.Namespace) -> None:
@@ -100,12 +80,11 @@ def check_listing(args: argparse.Namespace) -> None:
     for option, value in (("top", args.top), ("worst", args.worst)):
         if value < 0:
             raise ConfigError(f"--{option}: must be at least 0, got {value:,}")
-    known = [FELL, *(column.name for column in COLUMNS)]
-    if args.sort not in known:
-        raise ConfigError(f"--sort: there is no order '{args.sort}'{suggest(args.sort, known)}")
+    if args.sort not in (FELL, *COLUMNS):
+        raise ConfigError(f"--sort: there is no order '{args.sort}'{suggest(args.sort, (FELL, *COLUMNS))}")
     pages(args.page, None)
-    if args.parquet:
-        check_parquet("--parquet")
+    if args.parquet and find_spec("pyarrow") is None:
+        raise ConfigError("--parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'")
 
 
 def pages(text: str | None, count: int | None) -> list[int]:
@@ -124,61 +103,29 @@ def pages(text: str | None, count: int | None) -> list[int]:
     return numbers
 
 
-def device_of(args: argparse.Namespace) -> torch.device:
-    """Return the device to simulate on, and set torch up for it."""
+def run_episodes(policy: TrainedPolicy, wish: Wish, args: argparse.Namespace) -> tuple[Episodes, TaskConfig]:
+    """Run a policy's episodes on the device of the command line; return them and their task's configuration."""
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     settle_on(device)
-    return device
-
-
-def engine_from(args: argparse.Namespace) -> str:
-    """Return the argument that names the engine, for errors."""
-    return "--physics" if args.physics else "sim.physics"
-
-
-def folder_of(policy: TrainedPolicy) -> Path:
-    """Return the default folder of a policy's episodes."""
-    folder = policy.output("episodes")
-    return folder / "episodes" if folder == policy.folder else folder
+    return roll_out(policy, wish, device, not args.no_graph, "--physics" if args.physics else "sim.physics")
 
 
 def show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
-    """Print the list of episodes, and write it with the chosen pages and table into `folder`."""
+    """Print the list of episodes; write all of it as Markdown into `folder`, with the chosen pages and table."""
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = pages(args.page, len(episodes)) + order[: args.worst]
-    heads = heads_of(figures)
+    (heads, rows), counts = listing(figures, order), counts_text(figures)
     texts = [i for i, head in enumerate(heads) if head in ("ended by", "joint")]
-    rows = [row_of(figures, number) for number in order[: args.top]]
+    shown = screen_table(f"{counts}; by {args.sort}", [head.replace(" [", "\n[") for head in heads], rows[: args.top], texts)
     print()
-    title = f"{counts_text(figures)}; by {args.sort}"
-    Console(width=130).print(screen_table(title, [head.replace(" [", "\n[") for head in heads], rows, texts))
-    _write_list(folder, figures, order, args.sort)
+    Console(width=130).print(shown)
+    table = markdown_table(heads, rows, left=(1,))
+    write_text(folder / LIST, f"# Episodes\n\n{counts}. The worst come first, by {args.sort}.\n\n{table}\n")
+    print(f"written: {relative(folder / LIST)}")
     if args.parquet:
         write_parquet(episodes, folder)
     if wanted:
         projector = Projector(episodes, load_config(folder, "--page"))
         for number in dict.fromkeys(wanted):
             write_page(folder, episodes, figures, number, projector.show(number))
-
-
-def _write_list(folder: Path, figures: Figures, order: list[int], by: str) -> None:
-    """Write the whole list as Markdown."""
-    text = markdown_table(heads_of(figures), [row_of(figures, number) for number in order], left=(1,)) + "\n"
-    write_text(folder / LIST, f"# Episodes\n\n{counts_text(figures)}. The worst come first, by {by}.\n\n{text}")
-    print(f"written: {relative(folder / LIST)}")
-
-
-def label_of(episodes: Episodes) -> str:
-    """Return the name of a policy in tables of its episodes."""
-    run = str(episodes.about.get("run", episodes.about["task"])).split("/")
-    return f"{run[-1]} (shipped)" if "policies" in run else "/".join([*run[-2:], episodes.about["checkpoint"]])
-
-
-def print_statistics(folder: Path, found: dict[str, JointStatistics]) -> None:
-    """Print the tables of joint statistics, then write their files."""
-    console = Console(width=130)
-    for title, table in tables_of(found).items():
-        heads = [head.replace(", ", ",\n") for head in table.head]
-        console.print(screen_table(title, heads, [[text_of(cell) for cell in row] for row in table.rows]))
-    write_statistics(folder, found, "Joint statistics" if len(found) == 1 else "Joint statistics of two policies")

@@ -5,25 +5,14 @@ term; the episodes that went worst are listed. With --page or --worst each of th
 with one cursor.
 """
 
-import argparse
 from pathlib import Path
 
-from legged.cli.episodes.common import (
-    add_listing_arguments,
-    add_recording_arguments,
-    check_listing,
-    device_of,
-    engine_from,
-    folder_of,
-    pages,
-    show,
-    wish_of,
-)
+from legged.cli.episodes import common
 from legged.commandline.arguments import POLICY_HELP, add_checkpoint_argument, register_given
 from legged.commandline.command import command
 from legged.episodes.ranking import check_ended
-from legged.episodes.rollout import check_wish, roll_out
-from legged.episodes.stored import ABOUT, ARRAYS, NO_NUMBERS, TIME_UP, Episodes, save_episodes
+from legged.episodes.recorder import check_wish
+from legged.episodes.stored import ABOUT, ARRAYS, NO_NUMBERS, TIME_UP, save_episodes
 from legged.policies.restore import policy_of
 from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write, relative
@@ -42,8 +31,8 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("policy", metavar="POLICY", help=POLICY_HELP)
     add_checkpoint_argument(parser)
-    add_recording_arguments(parser)
-    add_listing_arguments(parser)
+    common.add_recording_arguments(parser)
+    common.add_listing_arguments(parser)
     parser.add_argument("--out", type=Path, help="folder for all files; episodes/ in the run folder by default")
     return parser
 
@@ -52,28 +41,22 @@ def build_parser() -> CommandParser:
 def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
-    check_listing(args)
-    episodes, folder = _recorded(args)
-    show(episodes, folder, args)
-    return 0
-
-
-def _recorded(args: argparse.Namespace) -> tuple[Episodes, Path]:
-    """Record episodes of the policy on the command line; return them and the folder where they are stored."""
+    common.check_listing(args)
     register_given(args, "policy")
-    wish = wish_of(args)
-    device = device_of(args)
-    policy = policy_of(args.policy, args.checkpoint)
-    pages(args.page, wish.episodes)
+    wish, policy = common.wish_of(args), policy_of(args.policy, args.checkpoint)
+    common.pages(args.page, wish.episodes)
     if args.ended is not None:  # checked before the recording replaces an older one
         terms = policy.cfg.terminations
         check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
     check_wish(policy, wish)
-    folder = args.out or folder_of(policy)
+    folder = args.out or policy.output("episodes")
+    if folder == policy.folder and args.out is None:
+        folder /= "episodes"
     steps = round(policy.cfg.env.episode_length_s / policy.cfg.dt)
     ready_to_write(folder, 8.0 + wish.episodes * steps * STEP_BYTES / 2**20)
-    episodes, cfg = roll_out(policy, wish, device, not args.no_graph, engine_from(args))
+    episodes, cfg = common.run_episodes(policy, wish, args)
     save_episodes(episodes, cfg, folder)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}, {len(episodes)} episodes in {episodes.about['physics']}")
     print(f"written: {relative(folder / ARRAYS)} and {ABOUT}")
-    return episodes, folder
+    common.show(episodes, folder, args)
+    return 0

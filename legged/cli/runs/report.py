@@ -18,7 +18,7 @@ from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
 from legged.evaluation.reports.run_report import command_on, write_report
 from legged.learning.run_folder import CONFIG_FILE, NOTE_FILE, find_checkpoint, run_config
-from legged.play.walking_film import film, write_film
+from legged.play.films import film, write_film
 from legged.policies.restore import TrainedPolicy
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, ready_to_write, relative, write_text

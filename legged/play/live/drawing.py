@@ -1,30 +1,31 @@
-"""Robots, their velocities and the ground in viser's scene."""
+"""Robots, their velocities and the ground in viser's scene, as triangle meshes with a normal and a colour per vertex."""
 
 from typing import Any
 
 import mujoco
 import numpy as np
 import torch
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
 from trimesh.visual.color import srgb_to_linear
+from trimesh.visual.material import PBRMaterial
 
 from legged.envs import LeggedRobot
+from legged.math import yaw_of
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
-from legged.play.live.shapes import PERIOD, body_meshes, plane_mesh, terrain_mesh
-from legged.rendering.framing import side_by_side, size_of, size_of_model
-from legged.rendering.task_cameras import ABOVE, APART, SPACING
+from legged.rendering import camera
+from legged.rendering.scene import add_horizon, add_painted_terrain
 from legged.robots.importing.convert import robot_spec_of
+from legged.terrain import Terrain
 
 GLIDE = np.array([0.25, 0.25, 0.06])
 """Share of the distance to the followed robot that the view covers per picture, along x, y, z: steps then shake it less."""
 CUT = 2.0
 """Distance above which the view jumps to the robot at once, because the robot was put somewhere else [m]."""
-ARROW = 0.6
-"""Length of an arrow for 1 m/s [m]."""
 ARROWS_EVERY = 3
 """Arrows move along in every picture; their lengths change in one of so many."""
-SLOWEST_SHOWN = 0.03
-"""Slower robots have no arrow [m/s]."""
 VIEW = np.array([-1.75, -2.1, 1.15])
 """First position of the browser's camera relative to the robot, in lengths of a robot."""
 AMBIENT = 0.35
@@ -37,6 +38,17 @@ NARROW = 700
 """Screens below this width have the controls below the picture instead of next to it [pixels]."""
 FARTHER, LOWER = 1.3, 1.0
 """On narrow screens the camera is so many times as far away and looks at a point so far below the robot, in its lengths."""
+SEGMENTS = 16
+"""Segments of round shapes along their circumference: few, because a browser may draw without a GPU."""
+FLANK = 0.85
+"""Brightness of the vertical faces of a terrain relative to its treads."""
+SHARP = 30.0
+"""Faces of a body that meet at a larger angle keep their edge [degrees]."""
+MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.85}
+PERIOD, HALF_PLANE = 2.0, 40.0
+"""Distance after which the squares of a plane repeat, and half the side of the drawn part, a multiple of it [m]."""
+Part = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Vertices (V, 3) [m], faces (F, 3) and sRGB colours (V, 3), 0 to 1."""
 
 
 class Drawing:
@@ -48,14 +60,14 @@ class Drawing:
         """Draw the session's robots and ground."""
         self.server, self.session = server, session
         self.follows = True
-        self._middle = np.zeros(3)
         self._turn = 0
         server.scene.set_up_direction("+z")
         server.scene.configure_environment_map("warehouse", environment_intensity=AMBIENT)
         server.scene.configure_fog(*FOG, color=SKY)
         self._world = server.scene.add_frame("/world", show_axes=False)
-        self._task: Any = None
         self._handles: list[Any] = []
+        self._above: list[Any] = []
+        self._arrows: list[Any] = []
         self.build()
         server.initial_camera.position = tuple(VIEW * self.length)
         server.initial_camera.look_at = (0.0, 0.0, -0.1 * self.length)
@@ -71,13 +83,22 @@ class Drawing:
         """Replace everything drawn by the session's current task."""
         for handle in self._handles:
             handle.remove()
-        session, scene = self.session, self.server.scene
-        self._task = task = session.task
-        model, size = self._model()
-        self.length = size.longest
-        self._model_drawn, self._data = model, mujoco.MjData(model)
-        self._offsets = self._side_by_side(task.num_envs)
+        scene = self.server.scene
+        self._task = task = self.session.task
         terrain = getattr(task, "terrain", None)
+        robots = range(task.num_envs)
+        if isinstance(task, LeggedRobot):
+            model, sides = robot_spec_of(task.robot.model_path, drawn=True).compile(), camera.size_of(task.robot)
+            columns = int(np.ceil(task.num_envs**0.5))
+        else:
+            model = task.physics.model
+            sides, columns = camera.size_of_model(model, model.qpos0), task.num_envs
+        self.length = float(sides.max())
+        self._model, self._data = model, mujoco.MjData(model)
+        # Offsets (N, 3) between where robots are and where they are drawn [m]; on a plane all start in one place.
+        self._offsets = camera.SPACING * self.length * camera.side_by_side(task.num_envs, columns)
+        if terrain is not None:
+            self._offsets[:] = 0.0
         self._plane = terrain is None
         ground = plane_mesh() if terrain is None else terrain_mesh(terrain)
         self._ground = scene.add_mesh_trimesh("/world/ground", ground, cast_shadow=False)
@@ -85,54 +106,24 @@ class Drawing:
         self._bodies = list(meshes)
         self._nodes = [
             [scene.add_mesh_trimesh(f"/world/bodies/{robot}/{body}", mesh) for body, mesh in meshes.items()]
-            for robot in range(task.num_envs)
+            for robot in robots
         ]
-        self._handles = [self._ground, *(node for nodes in self._nodes for node in nodes)]
-        self._above: list[Any] = []
-        self._arrows: list[Any] = []
-        if isinstance(task, LeggedRobot):
-            self._add_arrows(task.num_envs)
-        self._middle = self._base(session.followed)
+        self._above, self._arrows = [], []
+        if isinstance(task, LeggedRobot):  # frames above the robots that share their heading, and arrows in them
+            thick, nothing = 0.022 * self.length, np.full((2, 2, 3), HIDDEN, dtype=np.float32)
+            heads = {"shaft_radius": thick, "head_radius": 2.2 * thick, "head_length": 4.0 * thick}
+            colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)
+            names = [f"/world/above/{robot}" for robot in robots]
+            self._above = [scene.add_frame(name, show_axes=False) for name in names]
+            self._arrows = [scene.add_arrows(f"{name}/velocities", nothing, colors, **heads) for name in names]
+        self._handles = [self._ground, *(node for nodes in self._nodes for node in nodes), *self._above]
+        self._middle = self._base(self.session.followed)
         self.draw()
-
-    def _add_arrows(self, count: int) -> None:
-        """Add arrows above robots, in frames that share the robots' heading."""
-        scene, thick = self.server.scene, 0.022 * self.length
-        colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)
-        for robot in range(count):
-            self._above.append(scene.add_frame(f"/world/above/{robot}", show_axes=False))
-            self._arrows.append(
-                scene.add_arrows(
-                    f"/world/above/{robot}/velocities",
-                    np.full((2, 2, 3), HIDDEN, dtype=np.float32),
-                    colors,
-                    shaft_radius=thick,
-                    head_radius=2.2 * thick,
-                    head_length=4.0 * thick,
-                )
-            )
-        self._handles += self._above
-
-    def _model(self) -> tuple[mujoco.MjModel, Any]:
-        """Return the model whose bodies are drawn, and its size."""
-        task = self._task
-        if isinstance(task, LeggedRobot):
-            return robot_spec_of(task.robot.model_path, drawn=True).compile(), size_of(task.robot)
-        model = task.physics.model
-        return model, size_of_model(model, model.qpos0)
-
-    def _side_by_side(self, count: int) -> np.ndarray:
-        """Return offsets (N, 3) between where robots are and where they are drawn [m]; on a plane all start in one place."""
-        if getattr(self._task, "terrain", None) is not None:
-            return np.zeros((count, 3))
-        columns = int(np.ceil(count**0.5)) if isinstance(self._task, LeggedRobot) else count
-        return SPACING * self.length * side_by_side(count, columns)
 
     def _base(self, robot: int) -> np.ndarray:
         """Return the drawn position (3,) of a robot's base, world frame [m]; sets the poses of all its bodies."""
-        qpos = np.nan_to_num(self._task.physics.qpos[robot].cpu().numpy().astype(float))
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model_drawn, self._data)
+        self._data.qpos[:] = np.nan_to_num(self._task.physics.qpos[robot].cpu().numpy().astype(float))
+        mujoco.mj_kinematics(self._model, self._data)
         return np.asarray(self._data.xpos[1]) + self._offsets[robot]
 
     def draw(self) -> None:
@@ -140,10 +131,8 @@ class Drawing:
         if self._task is not self.session.task:
             self.build()
             return
-        count = self._task.num_envs
-        poses = []
-        bases = np.zeros((count, 3))
-        for robot in range(count):
+        poses, bases = [], np.zeros((self._task.num_envs, 3))
+        for robot in range(len(bases)):
             bases[robot] = self._base(robot)
             poses.append((self._data.xpos[self._bodies] + self._offsets[robot], self._data.xquat[self._bodies].copy()))
         if self.follows:
@@ -163,10 +152,9 @@ class Drawing:
     def _draw_velocities(self, bases: np.ndarray) -> None:
         """Draw two arrows above each of `bases` (N, 3) [m]: the commanded velocity, and above it the actual one."""
         task = self._task
-        w, x, y, z = np.nan_to_num(task.base_quat.cpu().numpy().astype(float)).T
-        half_yaw = 0.5 * np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        half_yaw = 0.5 * yaw_of(task.base_quat).nan_to_num().cpu().numpy()
         for frame, base, half in zip(self._above, bases, half_yaw, strict=True):
-            frame.position = base + np.array([0.0, 0.0, ABOVE * self.length])
+            frame.position = base + np.array([0.0, 0.0, camera.ABOVE * self.length])
             frame.wxyz = (np.cos(half), 0.0, 0.0, np.sin(half))
         self._turn = (self._turn + 1) % ARROWS_EVERY
         if self._turn:
@@ -174,9 +162,9 @@ class Drawing:
         velocities = torch.stack([task.commands[:, :2], task.base_lin_vel[:, :2]], dim=1).cpu().numpy()
         for arrows, seen in zip(self._arrows, np.nan_to_num(velocities), strict=True):
             points = np.zeros((2, 2, 3), dtype=np.float32)
-            points[1, :, 2] = APART * self.length
-            points[:, 1, :2] = ARROW * seen
-            points[np.linalg.norm(seen, axis=1) < SLOWEST_SHOWN, :, 2] = HIDDEN
+            points[1, :, 2] = camera.APART * self.length
+            points[:, 1, :2] = camera.ARROW * seen
+            points[np.linalg.norm(seen, axis=1) < camera.SLOWEST_SHOWN, :, 2] = HIDDEN
             if not np.array_equal(points, arrows.points):
                 arrows.points = points
 
@@ -184,3 +172,122 @@ class Drawing:
 def _light(color: str) -> np.ndarray:
     """Return a colour such as '#0072B2' as linear intensities (3,), 0 to 255, which arrows take instead of sRGB."""
     return np.round(255.0 * srgb_to_linear(np.array(list(bytes.fromhex(color[1:]))) / 255.0))
+
+
+# ---- shapes ------------------------------------------------------------------------------------------------------------
+
+
+def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
+    """Return the visible shapes of each body of a model except the world, in the frame of the body [m]."""
+    parts: dict[int, list[Part]] = {}
+    for geom in range(model.ngeom):
+        body, material, rgba = int(model.geom_bodyid[geom]), int(model.geom_matid[geom]), model.geom_rgba[geom]
+        if material >= 0 and np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default: the file sets no colour
+            rgba = model.mat_rgba[material]
+        if body == 0 or rgba[3] == 0.0 or model.geom_group[geom] >= camera.COLLISION_SHAPES:
+            continue
+        mesh = geom_mesh(model, geom)
+        if mesh is not None:
+            parts.setdefault(body, []).append((mesh.vertices, mesh.faces, np.tile(rgba[:3], (len(mesh.vertices), 1))))
+    return {body: _joined(own) for body, own in parts.items()}
+
+
+def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """Return a geom as a closed mesh in the frame of its body [m]; None for planes, height fields and lines."""
+    size, types = model.geom_size[geom], mujoco.mjtGeom
+    round_shape, edges = (SEGMENTS // 2, SEGMENTS), np.full(3, 1.0 / np.radians(SHARP))
+    match model.geom_type[geom]:
+        case types.mjGEOM_MESH:
+            own = model.mesh(int(model.geom_dataid[geom]))
+            vertices = model.mesh_vert[own.vertadr[0] :][: own.vertnum[0]]
+            mesh = trimesh.Trimesh(vertices, model.mesh_face[own.faceadr[0] :][: own.facenum[0]], process=False)
+        case types.mjGEOM_BOX:
+            mesh = trimesh.creation.box(extents=2.0 * size)
+        case types.mjGEOM_SPHERE | types.mjGEOM_ELLIPSOID as kind:
+            mesh, edges = trimesh.creation.uv_sphere(count=round_shape), np.zeros(3)
+            mesh.apply_scale(size if kind == types.mjGEOM_ELLIPSOID else size[0])
+        case types.mjGEOM_CAPSULE:
+            mesh, edges = trimesh.creation.capsule(2.0 * size[1], size[0], count=round_shape), np.zeros(3)
+        case types.mjGEOM_CYLINDER:
+            mesh, edges = trimesh.creation.cylinder(size[0], 2.0 * size[1], sections=SEGMENTS), np.array([0.0, 0.0, 1.0])
+        case _:
+            return None
+    pose = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+    pose[:3, 3] = model.geom_pos[geom]
+    return _split(mesh, edges).apply_transform(pose)
+
+
+def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with sharp edges: faces share a vertex only where their normals, in `edges` (3,) steps per unit length,
+    round to the same numbers. With zeros all faces share their vertices, so the surface is smooth.
+    """
+    keys = np.column_stack([mesh.faces.reshape(-1), np.repeat(np.round(mesh.face_normals * edges), 3, axis=0)])
+    kept, which = np.unique(keys, axis=0, return_inverse=True)
+    return trimesh.Trimesh(mesh.vertices[kept[:, 0].astype(int)], which.reshape(-1, 3), process=False)
+
+
+def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals) -> trimesh.Trimesh:
+    """Return a mesh whose normal at a vertex is the mean of the normals of its faces, weighted by their area."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # without scipy trimesh needs a slow loop
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], sides)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, visual=visual, process=False)
+
+
+def _joined(parts: list[Part]) -> trimesh.Trimesh:
+    """Return one mesh of several parts; files hold colours as linear intensities, as glTF wants."""
+    vertices, _, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    starts = np.cumsum([0, *(len(points) for points, _, _ in parts)])
+    faces = np.concatenate([own + start for (_, own, _), start in zip(parts, starts, strict=False)])
+    visual = TextureVisuals(material=PBRMaterial(**MATT))
+    light = np.column_stack([srgb_to_linear(colors), np.ones(len(colors))])
+    visual.vertex_attributes["color"] = np.round(255.0 * light).astype(np.uint8)
+    return _with_visual(vertices, faces, visual)
+
+
+def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
+    """Return a terrain as the C engine collides with it, world frame [m], with the colours of films and level ground around:
+    the tops and vertical faces of its steps, and the surface of its smooth tiles.
+    """
+    scene = mujoco.MjSpec()
+    add_painted_terrain(scene, terrain, checkered=True)
+    add_horizon(scene, terrain)
+    model = scene.compile()
+    boxes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+    box = trimesh.creation.box(extents=(2.0, 2.0, 2.0))
+    corners = box.vertices[box.faces].reshape(-1, 3)
+    brightness = np.repeat(np.where(box.face_normals[:, 2] > 0.5, 1.0, FLANK), 3)
+    vertices = (model.geom_pos[boxes, None] + model.geom_size[boxes, None] * corners).reshape(-1, 3)
+    colors = (model.geom_rgba[boxes, None, :3] * brightness[:, None]).reshape(-1, 3)
+    parts = [(vertices, np.arange(len(vertices)).reshape(-1, 3), colors)]
+    return _joined(
+        [*parts, *(_surface(model, int(i)) for i in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD))]
+    )
+
+
+def _surface(model: mujoco.MjModel, geom: int) -> Part:
+    """Return the upper side of a height field, split into triangles as MuJoCo splits it, with the colours of its texture."""
+    field = int(model.geom_dataid[geom])
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    half_x, half_y, high, _ = model.hfield_size[field]
+    heights = high * model.hfield_data[model.hfield_adr[field] :][: rows * columns].astype(float)
+    x, y = np.meshgrid(np.linspace(-half_x, half_x, columns), np.linspace(-half_y, half_y, rows))
+    vertices = np.column_stack([x.ravel(), y.ravel(), heights]) + model.geom_pos[geom]
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    one = np.stack([corner, corner + 1, corner + columns], axis=1)
+    other = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
+    texture = model.mat_texid[model.geom_matid[geom], mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    colors = model.tex_data[model.tex_adr[texture] :][: 3 * rows * columns].reshape(-1, 3) / 255.0
+    return vertices, np.concatenate([one, other]), colors
+
+
+def plane_mesh() -> trimesh.Trimesh:
+    """Return a square of the ground around the origin, with dark and light squares of half the PERIOD, which show motion."""
+    light = np.array([209.0, 214.0, 219.0])
+    squares = np.kron([[1.0, 0.94], [0.94, 1.0]], np.ones((128, 128)))[:, :, None] * light
+    corners = HALF_PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    material = PBRMaterial(baseColorTexture=Image.fromarray(squares.astype(np.uint8)), **MATT)
+    visual = TextureVisuals(uv=corners[:, :2] / PERIOD, material=material)
+    return _with_visual(corners, np.array([[0, 1, 2], [0, 2, 3]]), visual)

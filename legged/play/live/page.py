@@ -1,8 +1,10 @@
-"""The web page: viser's server with its scene, plots and controls."""
+"""The web page: its address, and viser's server with its scene, plots and controls."""
 
 import contextlib
 import io
+import ipaddress
 import queue
+import socket
 import time
 from collections.abc import Callable
 from functools import partial
@@ -10,11 +12,14 @@ from typing import Any
 
 from legged.errors import ConfigError
 from legged.learning.run_folder import BEST
-from legged.play.live.history import AXES, UNITS
-from legged.play.live.plots import LivePlots
-from legged.play.live.session import FASTEST, HARDEST_PUSH, SLOWEST, Session
-from legged.play.live.source import NEWEST
+from legged.play.live.plots import AXES, UNITS, LivePlots
+from legged.play.live.session import FASTEST, HARDEST_PUSH, NEWEST, SLOWEST, Session
+from legged.play.viewer import STEP
 
+HOST, PORT = "127.0.0.1", 8470
+"""Default host, which only this machine reaches, and the first port that is tried."""
+TRIES = 50
+"""Number of ports that are tried."""
 INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
 """Time between two pictures, two updates of the plots, and two checks for a newer checkpoint [s]."""
@@ -22,12 +27,51 @@ IDLE_S = 0.1
 """Time between two checks for visitors while the page has none and the simulation rests [s]."""
 SLOW = 0.9
 """The page warns when the pace is below this."""
-STEPS = (0.1, 0.1, 0.2)
-"""Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
 """Letters that change the command: axis and direction. Viser's camera uses other letters and the arrows."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
 """Directions of a push, from the robot's heading to the left [degrees]."""
+
+
+def free_port(host: str, port: int | None) -> int:
+    """Return the port of --port if it is free on `host`, or any free port for 0. Without `port`, return the first free one
+    from PORT on.
+
+    Raises:
+        ConfigError: the host is no address of this machine, or the port does not exist or is taken.
+    """
+    if port is not None and not 0 <= port <= 65535:
+        raise ConfigError(f"--port: must be from 0 to 65535, got {port}")
+    try:
+        family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(
+            f"--host: '{host}' is no address of this machine ({error}); {HOST} is this machine alone"
+        ) from error
+    reason = ""
+    for number in [port] if port is not None else [*range(PORT, PORT + TRIES), 0]:
+        try:
+            with socket.create_server((host, number), family=family) as probe:
+                return int(probe.getsockname()[1])
+        except OSError as error:
+            reason = error.strerror or str(error)
+    if port is None:
+        raise ConfigError(f"--host: no page can be served at '{host}' ({reason}); {HOST} is this machine alone")
+    raise ConfigError(f"--port: {port} can't be used at '{host}' ({reason}); leave it out, and a free one is found")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches a host."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def url(host: str, port: int) -> str:
+    """Return the URL of the page for a browser on this machine."""
+    shown = {"0.0.0.0": HOST, "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    return f"http://{shown}:{port}"
 
 
 def load_viser() -> Any:
@@ -49,14 +93,15 @@ class Page:
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
-        """Start the server; `legged.play.live.address.free_port` finds a free port."""
+        """Start the server; `free_port` finds a free port."""
         viser = load_viser()
         from legged.play.live.drawing import Drawing  # imports trimesh, which comes with viser
 
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-            self.server: Any = viser.ViserServer(host=host, port=port, label=session.cfg.task, verbose=False)
+            self.server: Any = viser.ViserServer(host=host, port=port, label=session.task.cfg.task, verbose=False)
+        self.port = int(self.server.get_port())
         # Viser lets any visitor publish the page through a public tunnel; that is switched off.
         self.server.request_share_url = lambda verbose=True: None
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -64,19 +109,16 @@ class Page:
         self.sliders: list[tuple[int, Any]] = []
         """Axis of the command and its slider."""
         self._add_controls()
-        self._add_plots()
         self._add_keys()
+        gui = self.server.gui
+        panel = gui.add_panel()
+        with panel.add_tab("Live"):
+            self.plots = LivePlots(self.server, session.history, session.has_commands)
+        panel.dock_right()
+        panel.set_width(360)
+        gui.main_panel.dock_left()
+        gui.main_panel.set_width(300)
         self.refresh()
-
-    @property
-    def port(self) -> int:
-        """Return the port of the server."""
-        return int(self.server.get_port())
-
-    @property
-    def visitors(self) -> int:
-        """Return the number of connected browsers."""
-        return len(self.server.get_clients())
 
     def close(self) -> None:
         """Stop the server."""
@@ -85,62 +127,62 @@ class Page:
 
     # ---- controls ----------------------------------------------------------------------------------------------------
 
-    def _later(self, what: Callable[[], object]) -> None:
-        """Queue an action for `run`."""
-        self._asked.put(what)
+    def _do(self, event: Callable[[Any], object], action: Callable[[], object]) -> None:
+        """Queue an action for `run` at each event of a control: its on_click, on_update or on_trigger."""
+        event(lambda _: self._asked.put(action))
 
     def _add_controls(self) -> None:
         gui, session = self.server.gui, self.session
         self.status = gui.add_markdown("")
-        self.choice = gui.add_dropdown("checkpoint", (NEWEST, BEST), initial_value=session.follower.choice, visible=False)
-        self.choice.on_update(lambda _: self._later(lambda: session.follow(str(self.choice.value))))
+        self.choice = gui.add_dropdown("checkpoint", (NEWEST, BEST), initial_value=session.watched.choice, visible=False)
+        self._do(self.choice.on_update, lambda: session.follow(str(self.choice.value)))
         if session.has_commands:
             with gui.add_folder("Command"):
-                self._add_command()
+                for axis, (name, unit, limits) in enumerate(zip(AXES, UNITS, session.ranges, strict=True)):
+                    low, high = (round(limit, 3) for limit in limits)
+                    if low == high:
+                        continue
+                    start = min(max(session.command[axis], low), high)
+                    slider = gui.add_slider(f"{name} [{unit}]", min=low, max=high, step=0.01, initial_value=start)
+                    self._do(slider.on_update, lambda axis=axis, slider=slider: session.ask(axis, float(slider.value)))
+                    self.sliders.append((axis, slider))
+                stand = gui.add_button("stand still" if session.clipped([0.0] * 3) == [0.0] * 3 else "slowest")
+                self._do(stand.on_click, lambda: self._steer(session.stand))
         with gui.add_folder("Time"):
-            self._add_time()
+            buttons = gui.add_button_group("", ("pause", "step", "reset"))
+            self._do(buttons.on_click, lambda: self._time(str(buttons.value)))
+            speed = gui.add_slider("speed", min=SLOWEST, max=FASTEST, step=0.1, initial_value=1.0)
+            self._do(speed.on_update, lambda: session.set_speed(float(speed.value)))
         with gui.add_folder("Camera"):
             follow = gui.add_checkbox("follow a robot", True)
             follow.on_update(lambda _: setattr(self.drawing, "follows", bool(follow.value)))
             if session.task.num_envs > 1:
-                self.robot = gui.add_slider("robot", min=1, max=session.task.num_envs, step=1, initial_value=1)
-                self.robot.on_update(lambda _: self._later(lambda: session.select(int(self.robot.value) - 1)))
+                robot = gui.add_slider("robot", min=1, max=session.task.num_envs, step=1, initial_value=1)
+                self._do(robot.on_update, lambda: session.select(int(robot.value) - 1))
         if len(session.grounds) > 1:
             with gui.add_folder("Terrain"):
-                self._add_terrain()
+                kind = gui.add_dropdown("type", tuple(session.grounds), initial_value=session.kind)
+                present = 0.5 if session.difficulty is None else session.difficulty
+                difficulty = gui.add_slider("difficulty", min=0.0, max=1.0, step=0.05, initial_value=present)
+                button = gui.add_button("put the robots there")
+                self._do(button.on_click, lambda: session.go_to(str(kind.value), float(difficulty.value)))
         if session.can_be_pushed:
             with gui.add_folder("Push"):
-                self._add_push()
+                direction = gui.add_dropdown("towards", tuple(DIRECTIONS), initial_value="left")
+                strength = gui.add_slider("by [m/s]", min=0.1, max=HARDEST_PUSH, step=0.1, initial_value=0.5)
+                everybody = gui.add_checkbox("all robots", False, visible=session.task.num_envs > 1)
+                push = gui.add_button("push")
 
-    def _add_command(self) -> None:
-        gui, session = self.server.gui, self.session
-        for axis, (name, unit, (low, high)) in enumerate(zip(AXES, UNITS, session.ranges, strict=True)):
-            low, high = round(low, 3), round(high, 3)
-            start = min(max(session.command[axis], low), high)
-            if low == high:
-                continue
-            slider = gui.add_slider(f"{name} [{unit}]", min=low, max=high, step=0.01, initial_value=start)
-            slider.on_update(lambda event, axis=axis: self._later(lambda: session.ask(axis, float(event.target.value))))
-            self.sliders.append((axis, slider))
-        stand = gui.add_button("stand still" if session.clipped([0.0] * 3) == [0.0] * 3 else "slowest")
-        stand.on_click(lambda _: self._later(self._stand))
+            def all_or_one() -> None:
+                session.push(DIRECTIONS[str(direction.value)], float(strength.value), bool(everybody.value))
 
-    def _stand(self) -> None:
-        self.session.stand()
-        self._show_command()
+            self._do(push.on_click, all_or_one)
 
-    def _show_command(self) -> None:
-        """Move the sliders to the present command."""
+    def _steer(self, change: Callable[[], object]) -> None:
+        """Change the command, and move the sliders to it."""
+        change()
         for axis, slider in self.sliders:
             slider.value = round(self.session.command[axis], 3)
-
-    def _add_time(self) -> None:
-        gui, session = self.server.gui, self.session
-        buttons = gui.add_button_group("", ("pause", "step", "reset"))
-        self.buttons = buttons
-        buttons.on_click(lambda _: self._later(lambda: self._time(str(buttons.value))))
-        self.speed = gui.add_slider("speed", min=SLOWEST, max=FASTEST, step=0.1, initial_value=1.0)
-        self.speed.on_update(lambda _: self._later(lambda: session.set_speed(float(self.speed.value))))
 
     def _time(self, what: str) -> None:
         session = self.session
@@ -153,85 +195,44 @@ class Page:
             session.reset()
         self.refresh()
 
-    def _add_terrain(self) -> None:
-        gui, session = self.server.gui, self.session
-        kind = gui.add_dropdown("type", tuple(session.grounds), initial_value=session.ground.kind)
-        difficulty = 0.5 if session.ground.difficulty is None else session.ground.difficulty
-        slider = gui.add_slider("difficulty", min=0.0, max=1.0, step=0.05, initial_value=difficulty)
-        button = gui.add_button("put the robots there")
-        button.on_click(lambda _: self._later(lambda: session.go_to(str(kind.value), float(slider.value))))
-
-    def _add_push(self) -> None:
-        gui, session = self.server.gui, self.session
-        direction = gui.add_dropdown("towards", tuple(DIRECTIONS), initial_value="left")
-        strength = gui.add_slider("by [m/s]", min=0.1, max=HARDEST_PUSH, step=0.1, initial_value=0.5)
-        everybody = gui.add_checkbox("all robots", False) if session.task.num_envs > 1 else None
-
-        def push() -> None:
-            all_of_them = everybody is not None and bool(everybody.value)
-            session.push(DIRECTIONS[str(direction.value)], float(strength.value), all_of_them)
-
-        gui.add_button("push").on_click(lambda _: self._later(push))
-
     def _add_keys(self) -> None:
         """Add keys for the buttons' actions; viser lists them in its palette."""
-        gui, session = self.server.gui, self.session
+        session = self.session
 
-        def key(letter: str, name: str, what: Callable[[], object]) -> None:
-            gui.add_command(name, hotkey=letter).on_trigger(lambda _: self._later(what))
+        def press(axis: int, change: float) -> None:
+            self._steer(lambda: session.ask(axis, round(session.command[axis] + change, 3)))
 
-        key("P", "pause or go on", lambda: self._time("pause"))
-        key("N", "one step", lambda: self._time("step"))
-        key("R", "reset", lambda: self._time("reset"))
-        if not session.has_commands:
-            return
-
-        def change(axis: int, sign: int) -> None:
-            session.ask(axis, round(session.command[axis] + sign * STEPS[axis], 3))
-            self._show_command()
-
-        for letter, axis, sign in KEYS:
-            name = f"{AXES[axis]} {'+' if sign > 0 else '-'}{STEPS[axis]:g} {UNITS[axis]}"
-            key(letter, name, partial(change, axis, sign))
-        key("space", "stand still", self._stand)
-
-    # ---- display ----------------------------------------------------------------------------------------------------
-
-    def _add_plots(self) -> None:
-        gui = self.server.gui
-        panel = gui.add_panel()
-        with panel.add_tab("Live"):
-            self.plots = LivePlots(self.server, self.session.history, self.session.has_commands)
-        panel.dock_right()
-        panel.set_width(360)
-        gui.main_panel.dock_left()
-        gui.main_panel.set_width(300)
+        keys: list[tuple[str, str, Callable[[], object]]] = [
+            ("P", "pause or go on", lambda: self._time("pause")),
+            ("N", "one step", lambda: self._time("step")),
+            ("R", "reset", lambda: self._time("reset")),
+        ]
+        if session.has_commands:
+            for letter, axis, sign in KEYS:
+                name = f"{AXES[axis]} {'+' if sign > 0 else '-'}{STEP[axis]:g} {UNITS[axis]}"
+                keys.append((letter, name, partial(press, axis, sign * STEP[axis])))
+            keys.append(("space", "stand still", lambda: self._steer(session.stand)))
+        for letter, name, action in keys:
+            self._do(self.server.gui.add_command(name, hotkey=letter).on_trigger, action)
 
     def refresh(self) -> None:
         """Update the status text and the plots."""
         session = self.session
-        lines = [f"**{session.title()}**"]
-        place = session.place()
         state = f"{session.time:.1f}\u00a0s" if session.running else f"paused at {session.time:.1f}\u00a0s"
         slow = f"too slow: {session.pace:.0%} of the time that should pass" if session.running and session.pace < SLOW else ""
-        lines.append(" · ".join(text for text in (f"robot {session.followed + 1}", place, state, slow) if text))
-        if session.problem:
-            lines.append(f"⚠ {session.problem}")
-        text = "\n\n".join(lines)
+        details = " · ".join(text for text in (f"robot {session.followed + 1}", session.place(), state, slow) if text)
+        text = "\n\n".join([f"**{session.title()}**", details, *([f"⚠ {session.problem}"] if session.problem else [])])
         if text != self.status.content:
             self.status.content = text
-        if self.choice.visible != session.follower.has_best:
-            self.choice.visible = session.follower.has_best
+        if self.choice.visible != session.watched.has_best:
+            self.choice.visible = session.watched.has_best
         self.plots.update(session.history)
 
     def do_what_was_asked(self) -> None:
         """Execute the actions that visitors requested since the last call."""
-        while True:
-            try:
-                what = self._asked.get_nowait()
-            except queue.Empty:
-                return
-            what()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._asked.get_nowait()()
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Simulate in real time while the page has visitors; end when `until` returns True, or at Ctrl-C."""
@@ -239,7 +240,7 @@ class Page:
         while not until():
             self.do_what_was_asked()
             now = time.perf_counter()
-            if self.visitors == 0:
+            if not self.server.get_clients():
                 time.sleep(IDLE_S)
                 last = time.perf_counter()
                 continue

@@ -1,14 +1,22 @@
 """Live plots of the followed robot: velocities and reward terms as viser's uPlot charts, and a gait diagram."""
 
+from collections import deque
 from collections.abc import Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
-from legged.figures import COLORS
-from legged.play.live.history import AXES, KEPT_S, UNITS, History
+from legged.envs import BaseTask, LeggedRobot
+from legged.figures import COLORS, without_common_words
+from legged.policies.episodes import unit_of
 
+KEPT_S = 10.0
+"""Length of the history [s]."""
+SMOOTHED_S = 0.2
+"""Window over which rewards are averaged, because some terms occur in single steps, such as touch-downs [s]."""
+AXES, UNITS = ("vx", "vy", "yaw rate"), ("m/s", "m/s", "rad/s")
+"""Names and units of the components of a command."""
 OTHERS = "#7F7F7F"
 """Colour of the sum of the smaller reward terms."""
 COMMANDED, ACTUAL = COLORS[1], COLORS[0]
@@ -22,6 +30,53 @@ LEFT, RIGHT, X_AXIS, FRAME = 44, 12, 30, 10
 """Width of the vertical axis, margin on the right, height of the time axis, and viser's own margin of a chart [pixels]."""
 SMALLEST_RANGE = 0.25
 """Velocity axes reach at least this far up and down [m/s, rad/s]."""
+Lines = tuple[dict[str, Any], ...]
+"""Options of uPlot for curves."""
+
+
+class History:
+    """The last KEPT_S of a robot with F feet, K control steps, oldest first. A step that ended an episode is NaN."""
+
+    def __init__(self, task: BaseTask) -> None:
+        self.terms = task.rewards.names
+        self.feet = task.robot.feet_names if isinstance(task, LeggedRobot) else ()
+        self.per_second = task.cfg.rewards.times_dt
+        """Rewards are counted per second, not per step."""
+        self.dt = task.dt
+        self.rows: deque[np.ndarray] = deque(maxlen=max(2, round(KEPT_S / task.dt)))
+        """Time, actual and commanded velocity (3 each), contacts (F), rewards in the task's unit (terms)."""
+
+    def add(self, task: BaseTask, robot: int, time: float) -> None:
+        """Add the last control step of a task's robot, at a simulated time [s]."""
+        row = np.full(7 + len(self.feet) + len(self.terms), np.nan)
+        row[0] = time
+        if not bool(task.reset_buf[robot]):
+            if isinstance(task, LeggedRobot):
+                row[1:3] = task.base_lin_vel[robot, :2].tolist()
+                row[3] = float(task.base_ang_vel[robot, 2])
+                row[4:7] = task.commands[robot, :3].tolist()
+                row[7 : 7 + len(self.feet)] = task.contacts.in_contact[robot].tolist()
+            else:
+                row[1] = float(task.physics.qvel[robot, 0])
+            row[7 + len(self.feet) :] = (task.rewards.last[:, robot] / unit_of(task)).tolist()
+        self.rows.append(row)
+
+    def curves(self) -> dict[str, np.ndarray]:
+        """Return `times` (K,) before the newest step [s]; `actual` and `commanded` (3, K), vx, vy [m/s] and yaw rate [rad/s],
+        base frame; `contacts` (F, K), 1 for feet on the ground; and `rewards` (terms, K), averaged over the SMOOTHED_S before
+        each step. Tasks without commands have only the actual vx, world frame; the other velocities are NaN.
+        """
+        feet = len(self.feet)
+        table = np.array(self.rows).reshape(-1, 7 + feet + len(self.terms)).T
+        (times,), actual, commanded, contacts, values = np.split(table, [1, 4, 7, 7 + feet])
+        width = max(1, round(SMOOTHED_S / self.dt))
+        counted = np.cumsum(np.isfinite(values), axis=1, dtype=float)
+        summed = np.cumsum(np.nan_to_num(values), axis=1)
+        for sums in (counted, summed):
+            sums[:, width:] -= sums[:, :-width].copy()
+        means = np.divide(summed, counted, out=np.full(values.shape, np.nan), where=np.isfinite(values))
+        found = {"times": times - times[-1:], "actual": actual, "commanded": commanded, "contacts": contacts}
+        return found | {"rewards": means}
 
 
 class LivePlots:
@@ -46,7 +101,7 @@ class LivePlots:
     def _chart(
         self,
         title: str,
-        lines: tuple[dict[str, Any], ...],
+        lines: Lines,
         height: int,
         legend: bool = True,
         time_axis: bool = True,
@@ -67,9 +122,10 @@ class LivePlots:
         )
 
     def update(self, history: History) -> None:
-        """Show the samples of a history."""
-        shown = slice(None, None, max(1, -(-len(history) // MOST_POINTS)))
-        times, actual, commanded = history.times(), history.actual(), history.commanded()
+        """Show a history."""
+        shown = slice(None, None, max(1, -(-len(history.rows) // MOST_POINTS)))
+        found = history.curves()
+        times, actual, commanded = found["times"], found["actual"], found["commanded"]
         names, rewards = reward_curves(history)
         with self._server.atomic():
             for axis, chart in enumerate(self._velocities):
@@ -88,14 +144,14 @@ def _line(name: str, color: str, dash: tuple[int, int] | None = None) -> dict[st
     return {"label": name, "stroke": color, "width": 1.6, **({"dash": dash} if dash else {})}
 
 
-def _reward_lines(names: Sequence[str]) -> tuple[dict[str, Any], ...]:
+def _reward_lines(names: Sequence[str]) -> Lines:
     """Return uPlot's options for reward curves; a curve after the LARGEST is the sum of the other terms."""
     return tuple(_line(name, COLORS[k]) if k < LARGEST else _line(name, OTHERS, DASH) for k, name in enumerate(names))
 
 
 def reward_curves(history: History) -> tuple[list[str], list[np.ndarray]]:
     """Return the names and values (K,) of the LARGEST reward terms in a history, then those of the sum of the others."""
-    values = history.rewards()
+    values = history.curves()["rewards"]
     sizes = np.abs(np.nan_to_num(values)).sum(axis=1)
     largest = sorted(np.argsort(-sizes, kind="stable")[:LARGEST].tolist())
     others = [i for i in range(len(history.terms)) if i not in largest]
@@ -108,28 +164,20 @@ def reward_curves(history: History) -> tuple[list[str], list[np.ndarray]]:
 
 def gait_diagram(history: History) -> str:
     """Return HTML with one row per foot, whose bars are the times at which the foot is on the ground."""
-    rows = []
-    for name, contacts in zip(short_names(history.feet), history.contacts(), strict=True):
+    found, rows = history.curves(), []
+    times = found["times"]
+    for name, contacts in zip(without_common_words(history.feet), found["contacts"], strict=True):
+        # The rows at which the foot comes down and leaves the ground; a row covers the `dt` before its time.
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], contacts > 0.5, [False]]).astype(int)))
         bars = "".join(
-            f'<rect x="{start:.3f}" width="{end - start:.3f}" height="1" fill="{ACTUAL}"/>'
-            for start, end in _stretches(history.times(), contacts > 0.5, history.dt)
+            f'<rect x="{times[a] - history.dt:.3f}" width="{times[b - 1] - times[a] + history.dt:.3f}" height="1"'
+            f' fill="{ACTUAL}"/>'
+            for a, b in edges.reshape(-1, 2)
         )
         # One unit of the drawing's width is a second, so the bars line up with the time axes of the charts.
         rows.append(
-            f'<div style="display:flex"><span style="width:{LEFT}px;margin:0 6px 0 4px;text-align:right">{escape(name)}'
+            f'<div style="display:flex"><span style="width:{LEFT}px;margin:0 6px 0 4px;text-align:right">{escape(name[:7])}'
             f'</span><svg viewBox="{-KEPT_S:g} 0 {KEPT_S:g} 1" preserveAspectRatio="none" style="flex:1;'
             f'height:11px;margin:3px {RIGHT + FRAME}px 2px 0;outline:1px solid #8884">{bars}</svg></div>'
         )
     return f'<div style="font-size:11px"><b style="margin-left:{LEFT + FRAME}px">feet on the ground</b>{"".join(rows)}</div>'
-
-
-def _stretches(times: np.ndarray, on: np.ndarray, dt: float) -> list[tuple[float, float]]:
-    """Return the starts and ends [s] of the stretches in which `on` (K,) holds; a sample covers the `dt` before its time."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], on, [False]]).astype(int)))
-    return [(float(times[a] - dt), float(times[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without the words that all of them share: LF and RF for LF_FOOT and RF_FOOT."""
-    shared = set.intersection(*(set(name.split("_")) for name in names))
-    return [("_".join(word for word in name.split("_") if word not in shared) or name)[:7] for name in names]

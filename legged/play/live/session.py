@@ -1,22 +1,37 @@
-"""The simulation behind a live view: a few robots, their policy, and the pace of time."""
+"""The simulation behind a live view: the watched policy, a few robots on the chosen ground, and the pace of time."""
 
+import time
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from legged.config import TaskConfig
-from legged.envs import BaseTask, LeggedRobot
+from legged.config import LeggedConfig, TaskConfig
+from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.run_folder import BEST
-from legged.play.live.ground import PLANE, ChosenGround, build, grounds_of
-from legged.play.live.history import History
-from legged.play.live.source import NEWEST, CheckpointFollower, Watched, age
+from legged.learning.run_folder import BEST, BEST_MODEL, checkpoints, find_checkpoint, newest_run, run_config, run_named
+from legged.math import yaw_of
+from legged.play.live.plots import History
+from legged.play.playground import SETTING, Playground
 from legged.policies.actor import Actor
+from legged.policies.restore import nominal, undisturbed
 from legged.process.paths import relative
+from legged.registry import make_task
+from legged.terrain import TERRAIN_TYPES, Terrain
 
+NEWEST = "newest"
+"""Choice of the newest checkpoint. The alternative, BEST, exists if the training evaluates its policy."""
+OWN, PLANE = "the task's own", "plane"
+"""Grounds without a chosen type: tiles of each type of the task, or a plane."""
+HOURS_S = 36000.0
+"""Length of an episode of robots that follow commands, so long that it does not end [s]."""
+APART = 1.0
+"""Largest distance from the middle of a tile at which robots that share it start, times the scale of the terrain [m]."""
 MOST_ROBOTS = 16
 """Largest number of robots."""
 SLOWEST, FASTEST = 0.1, 4.0
@@ -31,6 +46,98 @@ FREE_JOINT = 0
 """MuJoCo's joint type of a floating base."""
 
 
+@dataclass
+class Watched:
+    """A run folder or a shipped policy, which notices when the checkpoint to show changes."""
+
+    cfg: TaskConfig
+    folder: Path
+    checkpoint: int | None = None
+    """Iteration that is shown; None follows the training."""
+    choice: str = NEWEST
+    """Checkpoint that is followed: NEWEST or BEST; without effect if `checkpoint` is an iteration."""
+    shown: tuple[Path, int, int] | None = field(default=None, init=False)
+    """Last result of `changed`: file, time of its last change [ns] and size; None makes the next call return it again."""
+
+    @property
+    def has_best(self) -> bool:
+        """Return whether BEST can be chosen."""
+        return self.checkpoint is None and (self.folder / BEST_MODEL).is_file()
+
+    def wanted(self) -> Path | None:
+        """Return the checkpoint to show; None before the first one is written."""
+        found = checkpoints(self.folder)
+        if self.checkpoint is not None:
+            return found.get(self.checkpoint)
+        if self.choice == BEST and self.has_best:
+            return self.folder / BEST_MODEL
+        return found[max(found)] if found else None
+
+    def changed(self) -> Path | None:
+        """Return the checkpoint to show if it is another file than at the last call or was rewritten, else None."""
+        path = self.wanted()
+        if path is None:
+            return None
+        try:
+            stat = path.stat()
+        except OSError:  # replaced by a newer one
+            return None
+        before, self.shown = self.shown, (path, stat.st_mtime_ns, stat.st_size)
+        return None if self.shown == before else path
+
+
+def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
+    """Return the run that `name` names as POLICY; without a name the newest run of all. The run may be so young that it has
+    no checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
+
+    Raises:
+        ConfigError: there is no such run, or it has no such checkpoint.
+    """
+    folder = newest_run("POLICY") if name is None else run_named(name, "POLICY", begun=True)
+    cfg = run_config(folder)
+    if checkpoint in (None, -1):
+        return Watched(cfg, folder)
+    find_checkpoint(folder, checkpoint)
+    return Watched(cfg, folder, choice=BEST) if checkpoint == BEST else Watched(cfg, folder, int(checkpoint or 0))
+
+
+def grounds_of(cfg: TaskConfig) -> list[str]:
+    """Return the kinds of ground that can be chosen, the task's own first. A model with its own floor and a task whose
+    terrain is a single tile have only one.
+    """
+    if not isinstance(cfg, LeggedConfig):
+        return [OWN]
+    on_plane = cfg.terrain.mesh_type == "plane"
+    if not on_plane and cfg.terrain.num_rows * cfg.terrain.num_cols == 1:
+        return [OWN]
+    return [PLANE if on_plane else OWN, *TERRAIN_TYPES]
+
+
+def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) -> str:
+    """Return the kind of ground of --terrain and --difficulty: OWN, PLANE or a type of terrain.
+
+    Raises:
+        ConfigError: the type or the difficulty does not exist, or the task has a single ground.
+    """
+    kinds = grounds_of(cfg)
+    if isinstance(cfg, LeggedConfig) and len(kinds) > 1:
+        Playground.of(cfg, kind, difficulty)
+        return kinds[0] if kind is None else kind
+    for flag, given in (("terrain", kind), ("difficulty", difficulty)):
+        if given is not None:
+            raise ConfigError(f"--{flag}: '{cfg.task}' has no terrain to choose; it has one of its own")
+    return kinds[0]
+
+
+def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
+    """Return overrides for that many robots, undisturbed except for the overrides in `asked`."""
+    if isinstance(cfg, LeggedConfig):
+        keep_length = len(grounds_of(cfg)) == 1  # it ends at the edge of the tile, or a little before
+        seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
+        return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
+    return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
+
+
 class Session:
     """A few robots under a policy; not thread-safe."""
 
@@ -38,92 +145,59 @@ class Session:
         self,
         watched: Watched,
         changes: Sequence[tuple[str, Any]],
-        ground: ChosenGround,
+        kind: str,
+        difficulty: float | None = None,
         device: torch.device | str = "cpu",
         graph: bool = False,
     ) -> None:
-        """Build the task of the watched policy's configuration with `changes` on `ground`, and load the present checkpoint.
+        """Build the task of the watched policy's configuration with `changes` on ground of a `kind`, OWN, PLANE or a type of
+        terrain, with tiles of a `difficulty`, 0 to 1, that of `play` by default; and load the present checkpoint.
 
         Raises:
             ConfigError: the task cannot be built, or the policy does not fit it.
         """
-        self.watched, self.changes, self.ground = watched, list(changes), ground
+        self.watched, self.changes = watched, list(changes)
         self.device, self._graph = torch.device(device), graph
-        self.follower = CheckpointFollower(watched)
+        self.grounds = grounds_of(watched.cfg)
+        """Kinds of ground that can be chosen; a single one means that there is no choice."""
         self.iteration: int | None = None
         """Training iterations of the loaded policy; None without a checkpoint."""
-        self.checkpoint = self.follower.wanted()
+        self.checkpoint = watched.wanted()
         """File of the loaded policy."""
         self.problem = ""
         """Reason why a newer checkpoint or another ground was refused; empty if none was."""
-        self.running = True
-        self.speed = 1.0
+        self.running, self.speed = True, 1.0
         self.time = 0.0
         """Simulated time since the start of the session [s]."""
         self.followed = 0
         """Number of the robot that the camera follows and the plots show."""
-        self.command = [0.0, 0.0, 0.0]
-        """Command of all robots: vx, vy [m/s], yaw rate [rad/s]."""
         self.pace = 1.0
         """Share of the recently due steps that were made: below 1 if the machine is too slow."""
         self._due = self._wanted = self._made = 0.0
         if self.checkpoint is not None:  # before anything is built
-            self._check(self.checkpoint)
-        self._build(ground)
-        self.command = self.clipped(self.command)
-        self.reset()
-        self.look()
+            check_fits(self.checkpoint, read_checkpoint(self.checkpoint), watched.cfg)
+        self._build(kind, difficulty)
+        self.command = self.clipped([0.0, 0.0, 0.0])
+        """Command of all robots: vx, vy [m/s], yaw rate [rad/s]."""
         if self.problem:
             raise ConfigError(self.problem)
-
-    # ---- state ------------------------------------------------------------------------------------------------------
-
-    @property
-    def cfg(self) -> TaskConfig:
-        """Return the configuration of the present task."""
-        return self.task.cfg
-
-    @property
-    def has_commands(self) -> bool:
-        """Return whether the robots follow velocity commands."""
-        return isinstance(self.task, LeggedRobot)
-
-    @property
-    def can_be_pushed(self) -> bool:
-        """Return whether the base floats, as a push requires."""
-        joints = self.task.physics.model.jnt_type
-        return len(joints) > 0 and int(joints[0]) == FREE_JOINT
-
-    @property
-    def grounds(self) -> list[str]:
-        """Return the kinds of ground that can be chosen; a single one means that there is no choice."""
-        return grounds_of(self.watched.cfg)
-
-    @property
-    def ranges(self) -> list[tuple[float, float]]:
-        """Return the ranges of vx, vy [m/s] and yaw rate [rad/s] in training; empty for tasks without commands."""
-        if not isinstance(self.task, LeggedRobot):
-            return []
-        return [(low, high) for low, high in self.task.command_sampler.full_ranges.tolist()]
 
     # ---- the policy --------------------------------------------------------------------------------------------------
 
     def follow(self, choice: str) -> None:
-        """Show the newest or the best checkpoint from now on."""
-        if choice not in (NEWEST, BEST):
-            raise ValueError(f"there is no checkpoint '{choice}'")
-        self.follower.choice = choice
+        """Show the NEWEST or the BEST checkpoint from now on."""
+        self.watched.choice = choice
         self.look()
 
     def look(self) -> bool:
         """Load the checkpoint to show if it has changed; return whether a policy was loaded. If loading fails, `problem` has
         the reason and the present policy stays.
         """
-        path = self.follower.changed()
+        path = self.watched.changed()
         if path is None:
             return False
         try:
-            self._check(path)
+            check_fits(path, read_checkpoint(path), self.watched.cfg)
             self.iteration = self.act.load(path)
         except ConfigError as error:
             self.problem = str(error)
@@ -131,17 +205,16 @@ class Session:
         self.checkpoint, self.problem = path, ""
         return True
 
-    def _check(self, path: Any) -> None:
-        check_fits(path, read_checkpoint(path), self.watched.cfg)
-
     def title(self) -> str:
         """Return a line about the loaded policy."""
+        task = self.task.cfg.task
         if self.checkpoint is None or self.iteration is None:
-            return f"{self.cfg.task}: no checkpoint yet in {relative(self.watched.folder)}; robots keep their default pose"
-        name = relative(self.checkpoint)
-        seconds = age(self.checkpoint)
-        written = "" if seconds is None or not self.checkpoint.stem.startswith("model_") else f", written {ago(seconds)}"
-        return f"{self.cfg.task}: iteration {self.iteration}{written} ({name})"
+            return f"{task}: no checkpoint yet in {relative(self.watched.folder)}; robots keep their default pose"
+        written = ""
+        if self.checkpoint.stem.startswith("model_"):
+            with suppress(OSError):  # it may have been removed
+                written = f", written {ago(max(0.0, time.time() - self.checkpoint.stat().st_mtime))}"
+        return f"{task}: iteration {self.iteration}{written} ({relative(self.checkpoint)})"
 
     # ---- time --------------------------------------------------------------------------------------------------------
 
@@ -165,7 +238,7 @@ class Session:
     @torch.inference_mode()
     def step(self) -> None:
         """Make one control step of all robots."""
-        if isinstance(self.task, LeggedRobot):
+        if self.has_commands:
             self.observations = self.task.hold_commands(torch.tensor(self.command, device=self.device))
         if self.iteration is None:
             actions = torch.zeros(self.task.num_envs, self.task.num_actions, device=self.device)
@@ -179,7 +252,7 @@ class Session:
     def reset(self) -> None:
         """Reset all robots."""
         self.observations = self.task.reset()
-        self.history.clear()
+        self.history.rows.clear()
 
     def set_speed(self, speed: float) -> None:
         """Set the speed of the simulation as a multiple of real time."""
@@ -189,16 +262,12 @@ class Session:
 
     def clipped(self, command: Sequence[float]) -> list[float]:
         """Return a command of vx, vy [m/s] and yaw rate [rad/s], clipped to the ranges of the training."""
-        ranges = self.ranges
-        if not ranges:
-            return [0.0, 0.0, 0.0]
+        ranges = self.ranges or [(0.0, 0.0)] * 3
         return [min(max(float(value), low), high) for value, (low, high) in zip(command, ranges, strict=True)]
 
     def ask(self, axis: int, value: float) -> None:
         """Set one component of the command: 0 vx, 1 vy [m/s], 2 yaw rate [rad/s]."""
-        wanted = [*self.command]
-        wanted[axis] = value
-        self.command = self.clipped(wanted)
+        self.command = self.clipped([*self.command[:axis], value, *self.command[axis + 1 :]])
 
     def stand(self) -> None:
         """Set the command to zero, or to the slowest one of the training."""
@@ -207,7 +276,7 @@ class Session:
     def select(self, robot: int) -> None:
         """Follow another robot."""
         self.followed = min(max(int(robot), 0), self.task.num_envs - 1)
-        self.history.clear()
+        self.history.rows.clear()
 
     @torch.inference_mode()
     def push(self, degrees: float, strength: float, everybody: bool = False) -> None:
@@ -217,12 +286,9 @@ class Session:
         if not self.can_be_pushed:
             return
         strength = min(max(strength, 0.0), HARDEST_PUSH)
-        w, x, y, z = self.task.physics.qpos[:, 3:7].unbind(dim=1)
-        angle = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + np.radians(degrees)
-        mask = torch.ones(self.task.num_envs, dtype=torch.bool, device=self.device)
-        if not everybody:
-            mask.fill_(False)
-            mask[self.followed] = True
+        angle = yaw_of(self.task.physics.qpos[:, 3:7]) + np.radians(degrees)
+        mask = torch.full((self.task.num_envs,), everybody, device=self.device)
+        mask[self.followed] = True
         self.task.physics.push(mask, strength * torch.stack([angle.cos(), angle.sin()], dim=1))
         self.task.sense()
 
@@ -230,36 +296,50 @@ class Session:
         """Move the robots to tiles of a type and a difficulty, 0 to 1, to the task's own ground, or to a plane. If it cannot
         be built, `problem` has the reason and the present ground stays.
         """
-        if kind not in self.grounds:
-            raise ValueError(f"there is no ground '{kind}' for {self.cfg.task}")
         try:
-            self._build(ChosenGround(kind, difficulty))
+            self._build(kind, difficulty)
         except ConfigError as error:
             self.problem = str(error)
-            return
-        self.reset()
-        self.follower.forget()
-        self.iteration = None
-        self.look()
 
     def place(self) -> str:
         """Return a description of the ground below the followed robot: 'stairs_up, step height 0.194 m'."""
-        terrain = getattr(self.task, "terrain", None)
-        if self.playground is None or terrain is None:
-            return PLANE if self.ground.kind == PLANE else ""
-        return self.playground.label(terrain, self.task.base_pos[self.followed].tolist())
+        if self.playground is None:
+            return PLANE if self.kind == PLANE else ""
+        return self.playground.label(self.task.terrain, self.task.base_pos[self.followed].tolist())
 
-    def _build(self, ground: ChosenGround) -> None:
-        """Build the task on a ground, without a reset."""
-        task, playground = build(self.watched.cfg, self.changes, ground, self.device, self._graph)
-        assert isinstance(task, BaseTask)
-        self.task: Any = task
-        self.playground, self.ground = playground, ground
+    def _build(self, kind: str, difficulty: float | None) -> None:
+        """Build the task on a ground, and load the present checkpoint.
+
+        Raises:
+            ConfigError: the configuration cannot be built, or tiles are too small.
+        """
+        cfg = nominal(self.watched.cfg, self.changes)
+        playground: Playground | None = None
+        terrain: Terrain | None = None
+        if isinstance(cfg, LeggedConfig) and kind != PLANE and len(self.grounds) > 1:
+            playground = Playground.of(cfg, None if kind == OWN else kind, difficulty)
+        if isinstance(cfg, LeggedConfig) and playground is not None:
+            setting: list[tuple[str, Any]] = [*SETTING]
+            if cfg.env.num_envs > len(playground.order):
+                side = min(cfg.terrain.terrain_length, cfg.terrain.terrain_width)
+                setting.append(("terrain.spawn_range", min(APART * cfg.terrain.scale, 0.2 * side)))
+            cfg = nominal(self.watched.cfg, [*setting, *self.changes, *playground.changes(cfg)])
+            terrain = playground.build(cfg)
+        self.task: Any = make_task(cfg, self.device, self._graph, terrain)
+        self.can_be_pushed = self.task.physics.model.jnt_type[:1].tolist() == [FREE_JOINT]
+        """The base floats, as a push requires."""
+        self.has_commands = isinstance(self.task, LeggedRobot)
+        self.ranges: list[list[float]] = self.task.command_sampler.full_ranges.tolist() if self.has_commands else []
+        """Ranges of vx, vy [m/s] and yaw rate [rad/s] in training; empty for tasks without commands."""
+        self.playground, self.kind, self.difficulty = playground, kind, difficulty
         if playground is not None:
             playground.place(self.task)
         self.act = Actor(self.task, self.device)
         self.history = History(self.task)
         self.followed = min(self.followed, self.task.num_envs - 1)
+        self.reset()
+        self.iteration = self.watched.shown = None
+        self.look()
 
 
 def ago(seconds: float) -> str:

@@ -1,0 +1,221 @@
+"""Films as MP4, GIF or PNG: of a play, with text in its frames, and of a policy that walks straight ahead."""
+
+import errno
+import subprocess
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from legged.config import LeggedConfig, override
+from legged.envs import BaseTask
+from legged.errors import ConfigError, RunError
+from legged.play.playground import SETTING, Playground
+from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.process.paths import DISK_FULL, make_folder, relative, replacing
+from legged.rendering.camera import RobotsCamera, camera_of
+
+Film = list[np.ndarray]
+"""Pictures, each (height, width, 3) uint8."""
+PLAY_FPS = 25
+"""Frames per second of a play; fewer if control steps are longer."""
+GIF_FPS, GIF_S, GIF_SIZE = 8, 12.0, (416, 234)
+"""Frames per second, length [s], and width and height [pixels] of the GIF of a play."""
+FPS = 12.5
+"""Pictures per second of a walk; the duration of one, in hundredths of a second, must be whole in a GIF."""
+FILM_S, WARM_UP_S = 4.0, 2.0
+"""Length of the film of a walk, and of the walk before it [s]."""
+SPEED = 0.6
+"""Commanded forward velocity of a walk as a share of the largest trained one."""
+FILL, GLIDE = 0.82, 0.5
+"""Share of a picture that the robot fills in its default pose; share of the gap that the camera closes per picture."""
+SHARP = 2
+"""Pictures of a walk are rendered this many times larger, and scaled down to smooth edges."""
+MOST_BYTES = 2_000_000
+"""Size limit of a GIF."""
+SMALLER: tuple[tuple[int, float], ...] = (
+    *((96, 1.0), (64, 1.0), (48, 1.0), (48, 0.92), (48, 0.84), (48, 0.76)),
+    *((40, 0.7), (40, 0.6), (32, 0.5), (24, 0.4), (16, 0.3)),
+)
+"""Colours and scale of a GIF, tried in this order until it is small enough."""
+
+
+class Video:
+    """Recorder of pictures of a task's first robots; without a folder it does nothing."""
+
+    def __init__(self, task: BaseTask, count: int, folder: Path | None, gif: bool = False) -> None:
+        """Create the camera and the folder.
+
+        Raises:
+            RunError: this machine cannot render, or the folder cannot be created.
+        """
+        self.folder, self.gif = folder, gif
+        self.camera: Any = None
+        if folder:
+            try:
+                self.camera = camera_of(task, count)
+            except RunError as error:
+                raise RunError(f"{error}, or play with --no-video") from error
+            make_folder(folder)
+        self.every = max(1, round(1.0 / (PLAY_FPS * task.dt)))
+        """Control steps from one frame to the next."""
+        self.fps = 1.0 / (self.every * task.dt)
+        """Frames a second of the film, which shows real time."""
+        self.frames: Film = []
+        self._start = time.perf_counter()
+
+    def due(self, step: int) -> bool:
+        """Return whether a frame is due after this control step."""
+        return self.camera is not None and step % self.every == 0
+
+    def take(self, *lines: str, followed: int = 0) -> None:
+        """Record a frame with lines of text; over terrain the camera follows the robot number `followed`."""
+        self.camera.followed = followed
+        self.frames.append(self.camera.picture(lines))
+
+    def write(self) -> None:
+        """Write play.mp4 and, with `gif`, a smaller play.gif.
+
+        Raises:
+            RunError: a file cannot be written.
+        """
+        if self.camera is None or self.folder is None:
+            return
+        self.camera.close()
+        if self.gif:  # first: it needs no encoder
+            every = max(1, round(self.fps / GIF_FPS))
+            shown = [resized(frame, *GIF_SIZE) for frame in self.frames[: max(1, round(GIF_S * self.fps)) : every]]
+            write_film(shown, self.folder / "play.gif", self.fps / every)
+            print(f"video {relative(self.folder / 'play.gif')}")
+        write_mp4(self.frames, self.folder / "play.mp4", self.fps)
+        print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
+
+
+def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
+    """Return the configuration of a policy that follows velocity commands; `where` is the beginning of an error.
+
+    Raises:
+        ConfigError: the policy follows no commands.
+    """
+    if not isinstance(policy.cfg, LeggedConfig):
+        raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands: there is no way to ask it to walk")
+    return policy.cfg
+
+
+def film(policy: TrainedPolicy, side: int) -> Film:
+    """Let a robot walk straight ahead in C MuJoCo on the CPU, on a plane or on tiles of its most frequent terrain type of
+    training. Return pictures of `side` x `side` pixels.
+
+    Raises:
+        ConfigError: the policy follows no commands, or does not fit its task.
+        RunError: this machine cannot render.
+    """
+    cfg = walker(policy)
+    shares, rough = cfg.terrain.proportions, cfg.terrain.mesh_type != "plane"
+    playground = Playground.of(cfg, max(shares, key=lambda name: shares[name]) if rough else None, None)
+    changes: list[tuple[str, Any]] = [
+        *undisturbed(1, WARM_UP_S + FILM_S),
+        ("sim.physics", "mujoco"),
+        ("sim.threads", 1),
+        ("init_state.yaw", [0.0, 0.0]),
+        ("init_state.dof_pos_factor", [1.0, 1.0]),
+        ("init_state.base_velocity", [0.0, 0.0]),
+    ]
+    terrain = None
+    if playground is not None:
+        changes += [*SETTING, *playground.changes(cfg)]
+        terrain = playground.build(override(cfg, changes))  # type: ignore[arg-type]
+    task, act = restore(policy, changes, torch.device("cpu"), graph=False, terrain=terrain)
+    camera = RobotsCamera(task, 1, SHARP * side, SHARP * side)
+    camera.come_near(FILL, GLIDE)
+    camera.arrows = False
+    warm_up, every = round(WARM_UP_S / task.dt), max(1, round(1.0 / (FPS * task.dt)))
+    pictures = []
+    with torch.inference_mode(), closing(camera):
+        if playground is not None:
+            playground.place(task)
+        task.reset()
+        fastest = float(task.command_sampler.full_ranges[0, 1])
+        heading = None if playground is None else torch.zeros(1)
+        observations = task.hold_commands(torch.tensor([SPEED * fastest, 0.0, 0.0]), heading)
+        for step in range(warm_up + round(FILM_S / task.dt)):
+            observations, _, _, _ = task.step(act(observations))
+            if step >= warm_up and (step - warm_up) % every == 0:
+                pictures.append(resized(camera.picture(), side, side))
+    return pictures
+
+
+# ---- files -----------------------------------------------------------------------------------------------------------
+
+
+def resized(picture: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return a picture (height, width, 3) uint8 scaled to another size [pixels]."""
+    return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS))
+
+
+def write_mp4(frames: Film, path: Path, fps: float) -> None:
+    """Write pictures as a film with `fps` pictures per second.
+
+    Raises:
+        RunError: the film cannot be written.
+    """
+    try:
+        import imageio_ffmpeg  # nothing but a film needs it
+
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as error:
+        raise RunError(f"{relative(path)}: videos need ffmpeg: pip install 'imageio[ffmpeg]' ({error})") from error
+    height, width, _ = frames[0].shape
+    given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    wanted = ["-an", "-codec:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
+    with replacing(path) as part:
+        command = [program, "-y", "-loglevel", "error", *given, *wanted, str(part)]
+        # Through a pipe ffmpeg would not report a full disk; its exit code does.
+        done = subprocess.run(command, input=np.stack(frames).tobytes(), capture_output=True, check=False)
+        if done.returncode:
+            said = done.stderr.decode("utf-8", errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
+            if any("No space left" in line or "quota" in line for line in said):
+                raise OSError(errno.ENOSPC, DISK_FULL)
+            raise RunError(f"{relative(path)}: ffmpeg could not write the video: {said[0]}")
+    print(f"video {relative(path)}")
+
+
+def write_film(pictures: Film, path: Path, fps: float = FPS) -> str:
+    """Write a GIF of at most MOST_BYTES, or the film's middle picture if the name ends with .png; return a line on the file.
+
+    Raises:
+        RunError: the file can't be written, or the GIF is too large at the smallest scale.
+    """
+    make_folder(path.parent)
+    if path.suffix == ".png":
+        with replacing(path) as part:
+            Image.fromarray(pictures[len(pictures) // 2]).save(part)
+        return f"written: {relative(path)}, {path.stat().st_size / 1e6:.2f} MB"
+    for colors, scale in SMALLER:
+        height, width = (round(scale * length) for length in pictures[0].shape[:2])
+        small = [Image.fromarray(resized(picture, width, height)) for picture in pictures]
+        palette = _palette(np.concatenate([np.asarray(picture) for picture in small[:: max(1, len(small) // 6)]]), colors)
+        first, *rest = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in small)
+        with replacing(path) as part:
+            first.save(part, save_all=True, append_images=rest, duration=round(1000 / fps), loop=0, optimize=True)
+        size = path.stat().st_size
+        if size <= MOST_BYTES:
+            shown = f"{len(pictures)} pictures of {width} x {height} pixels, {colors} colours"
+            return f"written: {relative(path)}, {size / 1e6:.2f} MB, {shown}"
+    path.unlink(missing_ok=True)
+    raise RunError(f"{relative(path)}: would be larger than {MOST_BYTES / 1e6:g} MB; make its pictures smaller")
+
+
+def _palette(pixels: np.ndarray, colors: int) -> Image.Image:
+    """Return a palette for pixels (..., 3) uint8. The weight of a colour is the square root of its frequency, so that the
+    floor does not take all colours.
+    """
+    fine = (pixels.reshape(-1, 3) >> 2).astype(np.int64)
+    found, counts = np.unique(fine @ np.array([1 << 12, 1 << 6, 1]), return_counts=True)
+    color = np.stack([found >> 12, found >> 6 & 63, found & 63], axis=1) * 4 + 2
+    weighted = np.repeat(color, np.sqrt(counts).astype(int), axis=0).astype(np.uint8)
+    return Image.fromarray(weighted[None]).quantize(colors, Image.Quantize.MEDIANCUT, kmeans=2)
