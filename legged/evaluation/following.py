@@ -182,11 +182,12 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
         ConfigError: a checkpoint holds no time; nothing is measured then.
         RunError: the file can't be written.
     """
-    there = {}
+    there: dict[Path, float] = {}
     for path in checkpoints(setting.policy.folder).values():
-        there[path] = (read_checkpoint(path).get("infos") or {}).get("wall_s")
-        if not isinstance(there[path], int | float):
+        written_s = (read_checkpoint(path).get("infos") or {}).get("wall_s")
+        if not isinstance(written_s, int | float):
             raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
+        there[path] = float(written_s)
     task, act = ready_to_track(setting, grid)
     rows: list[dict[str, Any]] = []
     lost = 0
@@ -197,7 +198,7 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
         figures = measure_tracking(task, act, grid)
         lost += figures["contact_overflows"]
         errors = {name: figures[name]["mean"] for name in ("rmse_lin", "rmse_ang")}
-        rows.append({"iteration": iteration, "wall_s": float(seconds), **errors, "falls": figures["falls"]})
+        rows.append({"iteration": iteration, "wall_s": seconds, **errors, "falls": figures["falls"]})
         lin, ang = (float("nan") if error is None else error for error in errors.values())
         print(f"{iteration:9} {seconds:8.1f} {lin:20.3f} {ang:22.3f} {100 * figures['falls']:10.2f}", flush=True)
     first = next((row for row in rows if walks(row, rmse, falls)), None)

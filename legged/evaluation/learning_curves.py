@@ -269,7 +269,7 @@ def levels(logs: Sequence[Log]) -> list[Chart]:
     types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]
     if not types:
         return []
-    always = {always_promoted(log.config) for log in logs} - {None}
+    always = {highest for log in logs if (highest := always_promoted(log.config)) is not None}
     level = ("always promoted", always.pop()) if len(always) == 1 else None
 
     def lines(beginning: str, width: int) -> list[Line]:

@@ -79,7 +79,7 @@ def grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
     if args is not None:
         texts = {axis: getattr(args, axis) for axis in AXES}
         axes |= {axis: axis_values(f"--{axis}", text) for axis, text in texts.items() if text is not None}
-    grid = Grid(**axes, robots=ROBOTS if args is None else args.robots)
+    grid = Grid(axes["vx"], axes["vy"], axes["yaw"], ROBOTS if args is None else args.robots)
     check_size(grid)
     return grid
 

@@ -216,8 +216,9 @@ def _evaluations(record: Record) -> list[Part]:
     for label, tracking in tracked:
         counted = falls_of(tracking)
         errors = [number(tracking[name][part]) for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")]
-        falls = [number(100.0 * tracking["falls"], ".2f"), between(wilson(*counted), 100.0, ".2f") if counted else "-"]
-        rows.append([label, *errors, *falls, number(tracking.get("cost_of_transport"), ".2f")])
+        around = between(wilson(*counted), 100.0, ".2f") if counted else "-"
+        falls, cost = number(100.0 * tracking["falls"], ".2f"), number(tracking.get("cost_of_transport"), ".2f")
+        rows.append([label, *errors, falls, around, cost])
     heads = ["engine", "velocity RMSE [m/s]", "worst cell", "yaw rate RMSE [rad/s]", "worst cell", "falls [%]"]
     parts += [Paragraph(ON_GRID), Table([*heads, "95 % interval", "cost of transport"], rows)] if rows else []
     maps = [drawing for label, tracking in tracked for drawing in _heat_maps(tracking, label)]
