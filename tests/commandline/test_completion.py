@@ -101,7 +101,7 @@ def test_keys_are_offered_section_by_section(complete, tmp_path):
 def test_a_task_that_has_come_later_is_offered(tmp_path, monkeypatch):
     folder = tmp_path / "a folder"
     folder.mkdir()
-    monkeypatch.setattr(completion, "data_folder", lambda _: folder)
+    monkeypatch.setattr("legged.cli.completion.data_folder", lambda _: folder)
     (tmp_path / "script").write_text(written("bash"))
     command = ["bash", "--norc", "-c", BASH, "test", str(tmp_path / "script"), "legged", "train", ""]
     for names in (["early"], ["early", "zz_later"]):
