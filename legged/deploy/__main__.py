@@ -71,8 +71,10 @@ def _main(argv: list[str] | None) -> int:
     limits = limits_of(args)
     if not args.robot.startswith("udp:") and args.robot not in KINDS:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
-    if args.log.suffix != ".npz" or args.log.is_dir():
-        raise ConfigError(f"--log: must be a file that ends in .npz, got '{args.log}'")
+    if args.log.suffix != ".npz":
+        raise ConfigError(f"--log: must end in .npz, got '{args.log}'")
+    if args.log.is_dir():
+        raise ConfigError(f"--log: {args.log} is a folder; expected a file")
     ready_to_write(args.log.parent)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
