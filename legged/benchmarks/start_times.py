@@ -62,7 +62,7 @@ def start_report(times: dict[str, Any]) -> str:
 
 def _run(command: list[str], environment: dict[str, str]) -> dict[str, float]:
     """Run a process in an empty folder; return the end of each stage, and of the process as `end` [s]."""
-    # Where this package is not installed, the process finds it as this one did.
+    # The process finds this package as this process did, even if it is not installed.
     path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
     with tempfile.TemporaryDirectory() as folder:
         start = time.time()

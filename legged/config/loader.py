@@ -151,8 +151,8 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Merge layers, so that the nearest file has the last word. On a CPU, the `cpu:` section of each layer is merged on top
-    of it.
+    """Merge layers. A value of the nearest file replaces those of files that it extends. On a CPU, the `cpu:` section of each
+    layer is merged on top of it.
 
     Each layer is checked separately, so that a later one can't hide a mistake. Numbers of a layer with a reference robot are
     rescaled for `robot`, or if None, for the robot that the layers name.

@@ -92,7 +92,7 @@ class ObservationsConfig:
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
     """Term -> range of each robot's delay, drawn for an episode, in control steps."""
     dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
-    """Term -> share of the control steps in which its packet is lost. The values of the step before then stay."""
+    """Term -> share of the control steps in which its packet is lost. The values of the previous step are then kept."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Absolute value at which scaled observations are clipped."""
 

@@ -98,7 +98,8 @@ def _check_student(cfg: TaskConfig) -> None:
     """Check a student against the settings of distillation.
 
     Raises:
-        ConfigError: it has a learned standard deviation or an estimator, or gradients would leave steps over.
+        ConfigError: it has a learned standard deviation or an estimator, or its gradient_length does not divide the steps of
+        an iteration.
     """
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:

@@ -22,7 +22,7 @@ from legged.rendering import RobotsCamera, camera_of
 WIDTH, HEIGHT = 640, 360
 """Size of a picture [pixels]."""
 FPS, MOST_PICTURES = 25.0, 400
-"""Pictures a second, and most pictures of an episode; longer episodes have fewer a second."""
+"""Pictures per second, and the largest number of pictures of an episode; longer episodes have fewer per second."""
 FILL, GLIDE = 0.5, 0.3
 """Share of the picture that a robot fills, and share of the distance to it that the camera moves in a picture."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)

@@ -80,7 +80,7 @@ def _facts(episodes: Episodes, figures: Figures, number: int) -> list[tuple[str,
 
 
 def _sums(episodes: Episodes, number: int) -> list[tuple[str, str]]:
-    """Return the return by part, the largest first."""
+    """Return the parts of an episode's return, the largest first."""
     sums = np.nan_to_num(episodes.of(number)["reward_parts"]).sum(axis=0, dtype=np.float64)
     names = episodes.columns("reward_parts")
     order = np.argsort(-np.abs(sums), kind="stable")

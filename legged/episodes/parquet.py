@@ -39,7 +39,7 @@ def flat_columns(episodes: Episodes) -> dict[str, np.ndarray]:
 
 
 def write_parquet(episodes: Episodes, folder: Path) -> None:
-    """Write TABLE into `folder`, a row a control step.
+    """Write TABLE into `folder`, with one row for each control step.
 
     Raises:
         RunError: the file can't be written.

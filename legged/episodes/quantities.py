@@ -134,7 +134,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
             "contact forces on the feet at the last physics step, world frame, by x, y, z",
             feet,
         ),
-        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot touches, or did a step before", feet),
+        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 in contact, now or in the previous step", feet),
         Quantity(
             "contact_force",
             lambda: task.contact_forces.norm(dim=2),
@@ -194,7 +194,7 @@ def _largest_torques(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _actions(task: BaseTask) -> tuple[str, ...]:
-    """Return whose every action is."""
+    """Return the name of the joint or actuator of each action."""
     if isinstance(task, LeggedRobot):
         return tuple(task.robot.joint_names[i] for i in task.control.acted)
     model = task.physics.model

@@ -34,7 +34,8 @@ COLUMNS = (
 )
 """Figures by which episodes can be sorted, as far as a task has them."""
 FELL = "fell"
-"""The order of what failed, the shortest first; then the rest, the worst in tracking or return first."""
+"""Order with failed episodes first, the shortest of them at the top, then the others by tracking error or return, the worst
+first."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Figures:
     failed: np.ndarray
     """(E,)"""
     ended: list[list[str]]
-    """Which terms ended each episode."""
+    """Terms that ended each episode."""
     ends: list[str]
     """Names of everything that can end an episode."""
 

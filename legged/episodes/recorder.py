@@ -62,12 +62,11 @@ def record_episodes(
     graph: bool = True,
 ) -> tuple[Episodes, int]:
     """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, and how often a
-    robot lost contacts in a step for want of memory.
+    robot lost contacts in a step because memory was full.
 
-    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off, and short episodes are not more
-    frequent than they should be, as they are among the episodes that end first. All robots hold `command`, vx, vy [m/s] and
-    yaw rate [rad/s], if it is given. `place` is called before the first reset to place robots. With `graph` the step is
-    captured on a GPU.
+    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off. Among the episodes that end first,
+    short ones would be too frequent. All robots hold `command`, vx, vy [m/s] and yaw rate [rad/s], if it is given. `place` is
+    called before the first reset to place robots. With `graph` the step is captured on a GPU.
 
     Raises:
         TermError: the step cannot be captured.

@@ -1,4 +1,4 @@
-"""Episodes of a policy: the task is rebuilt with or without disturbances, and described for the file."""
+"""Recording of a policy's episodes in its task, with or without disturbances, and the description of the recorded arrays."""
 
 from dataclasses import dataclass, replace
 from functools import partial

@@ -40,8 +40,8 @@ def write_statistics(folder: Path, found: Found, title: str) -> list[Path]:
 
 
 def tables_of(found: Found) -> dict[str, Table]:
-    """Return title -> table, one a quantity: a line a joint, mean and standard deviation of each policy, and of two policies
-    the difference of their means; last, a table of gait cycles if there are any.
+    """Return title -> table, one table for each quantity, with one line for each joint: mean and standard deviation of each
+    policy, and for two policies the difference of their means. The last table is on gait cycles, if there are any.
     """
     several, tables = list(found.values()), {}
     for name, title in _measured(found):
@@ -114,7 +114,7 @@ def draw_statistics(found: Found, path: Path) -> None:
 
 
 def _draw_cycles(axes: np.ndarray, found: Found, name: str, labelled: bool) -> None:
-    """Draw one quantity over the gait cycle, a panel a joint."""
+    """Draw one quantity over the gait cycle, one panel for each joint."""
     first, phase = next(iter(found.values())), 100.0 * np.arange(PHASES) / PHASES
     for k, one in enumerate(found.values()):
         mean, std = one.over_cycle(name)
@@ -129,7 +129,7 @@ def _draw_cycles(axes: np.ndarray, found: Found, name: str, labelled: bool) -> N
 
 
 def _draw_means(axes: np.ndarray, found: Found, name: str, labelled: bool) -> None:
-    """Draw mean and standard deviation of one quantity, a line a joint."""
+    """Draw mean and standard deviation of one quantity, one line for each joint."""
     (axis,), joints = axes, next(iter(found.values())).joints
     at = np.arange(len(joints))
     for k, one in enumerate(found.values()):

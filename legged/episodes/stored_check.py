@@ -18,7 +18,7 @@ PER_EPISODE = {
     "first_qpos": "generalised positions before the first step",
     "first_qvel": "and velocities",
 }
-"""Arrays with a row an episode; the others have a row a control step, one episode after the other."""
+"""Arrays with one row for each episode. The others have one row for each control step, one episode after the other."""
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 LEGS = ("base_lin_vel", "base_ang_vel", "ground", "command", "feet_pos", "feet_force", "feet_contact", "contact_force")
 """Arrays of legged robots, besides those above and those of joints."""

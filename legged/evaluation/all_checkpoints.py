@@ -21,7 +21,7 @@ WALKING_RMSE = 0.15
 WALKING_FALLS = 0.01
 """Largest share of falls of a robot that walks, by default."""
 LARGEST_RMSE = 100.0
-"""Largest velocity RMSE that can be asked for [m/s]."""
+"""Largest velocity RMSE that --rmse accepts [m/s]."""
 
 
 def check_limits(rmse: float, falls: float) -> None:

@@ -1,4 +1,4 @@
-"""The physics engines in which policies are measured: settings, labels and looks of curves."""
+"""The physics engines in which policies are measured: settings, labels and line styles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

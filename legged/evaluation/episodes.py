@@ -48,7 +48,7 @@ def evaluate_episodes(
 
 
 def header(policy: TrainedPolicy, engine: str, device: str, asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the fields that every result has; `asked` are overrides, of which the result names those that change the
+    """Return the fields that every result has; `asked` holds the overrides. The result names those that change the
     conditions.
     """
     what = {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}

@@ -36,8 +36,8 @@ class EstimateMeter:
         self._counted += counted
 
     def found(self) -> dict[str, Any]:
-        """Return, as `estimates`, for each term the root mean square error of its numbers over robots and steps, with its
-        unit; null if no step was counted. Return nothing for a policy without an estimator.
+        """Return `estimates`: the root mean square error of each term over robots and steps, with its unit; null if no step
+        was counted. Return nothing for a policy without an estimator.
         """
         if self._network is None:
             return {}

@@ -33,10 +33,10 @@ def evaluate_following(
     folder: Path,
     where: str = "sim.physics",
 ) -> int:
-    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type with `robots` a size.
-    Print tables, then write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the exit code.
-    A part that is not measured stays in the file if it is of the same checkpoint. `where` names the setting of the engine in
-    errors.
+    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type with `robots` robots for
+    each size. Print tables, then write evaluation_<physics>.json and .png and success_<physics>.png into `folder`. Return the
+    exit code. The file keeps a part that is not measured now if that part belongs to the same checkpoint. `where` names the
+    setting of the engine in errors.
 
     Raises:
         RunError: a file can't be written.
@@ -48,7 +48,7 @@ def evaluate_following(
     head = header(policy, engine, device_name(device), asked)
     tracking, lost = ({}, 0) if grid is None else _tracking(policy, grid, asked, device, graph)
     success = success_over_difficulty(policy, sizes, robots, asked, device, graph) if sizes else None
-    # The screen comes first: a full disk cannot take it away.
+    # Results are printed first, so that a full disk cannot lose them.
     shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
     if tracking:
         print_tracking(shown)

@@ -1,4 +1,4 @@
-"""Contacts that an engine lost for want of memory during a measurement."""
+"""Contacts that an engine lost during a measurement because its memory was full."""
 
 import sys
 from typing import Any
@@ -9,7 +9,7 @@ from legged.envs import BaseTask
 
 
 class Overflows:
-    """Counter of lost contacts: robots times control steps. The task starts its own count anew with every rollout it logs."""
+    """Counter of lost contacts: robots times control steps. The task's own count restarts with every rollout that it logs."""
 
     NAME = "Metrics/contact_overflows"
 
@@ -17,7 +17,7 @@ class Overflows:
         self._logged: list[Tensor] = []
 
     def add(self, extras: dict[str, Any]) -> None:
-        """Keep what a step returned, if it closed a rollout."""
+        """Add the count that a step returned, if the step ended a rollout."""
         if "log" in extras:
             self._logged.append(extras["log"][self.NAME])
 

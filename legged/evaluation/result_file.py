@@ -63,7 +63,7 @@ def kept_success(path: Path, head: dict[str, Any]) -> dict[str, Any]:
 
 
 def _same(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the result at `path` if its head is the same, policy's file included; an empty one otherwise."""
+    """Return the result at `path` if its head is the same, including the policy's file; otherwise an empty result."""
     try:
         old = json.loads(path.read_text(encoding="utf-8"))
         same = isinstance(old, dict) and all(old.get(name) == value for name, value in head.items())
@@ -116,7 +116,7 @@ def device_name(device: torch.device) -> str:
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
-    """Write a result as a JSON file, and its folder where it is not there.
+    """Write a result as a JSON file, and make its folder if it is missing.
 
     Raises:
         RunError: the file can't be written.

@@ -184,7 +184,7 @@ def measure_success(
     task: LeggedRobot, act: Callable[[TensorDict], Tensor], sizes: Sequence[float], robots: int
 ) -> tuple[list[dict[str, Any]], int]:
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
-    lost contacts in a control step for want of memory.
+    lost contacts in a control step because memory was full.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -193,8 +193,8 @@ def measure_success(
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
-    """Run all robots out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a robot
-    lost contacts.
+    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a
+    robot lost contacts.
     """
     place(task, robots)
     task.reset()
@@ -240,8 +240,8 @@ def success_over_difficulty(
     device: torch.device,
     graph: bool = True,
 ) -> dict[str, Any]:
-    """Measure all `sizes` of each type with `robots` robots each, and print a line a type; `changes` to the configuration
-    come after those of the measurement. Return plain numbers and lists.
+    """Measure all `sizes` of each type with `robots` robots each, and print a line for each type; `changes` to the
+    configuration come after those of the measurement. Return plain numbers and lists.
     """
     assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
     cfg: Any = override(policy.cfg, changes)  # another scale asks for other lengths

@@ -77,7 +77,7 @@ def draw_tracking(result: dict[str, Any], path: Path) -> None:
             axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
             axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
             axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
-            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # of nothing, where all robots fell
+            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # mean of no values, where all robots fell
             for (i, j), value in np.ndenumerate(values):
                 dark = value > 0.6 * largest
                 axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")

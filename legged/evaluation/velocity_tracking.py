@@ -54,12 +54,13 @@ def place_to_track(
 
 @torch.inference_mode()
 def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
-    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
+    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, with one entry for each cell in
+    "cells".
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
-    power of the cost of transport is that of the last physics step of each control step, which is below the mean over all.
-    `contact_overflows` counts robots times steps that lost contacts for want of memory; `estimates` holds the errors of a
-    policy with an estimator.
+    power of the cost of transport is that of the last physics step of each control step, which is lower than the mean over
+    all physics steps. `contact_overflows` counts robots times steps that lost contacts because memory was full; `estimates`
+    holds the errors of a policy with an estimator.
     """
     cells = grid.cells
     device = torch.device(task.device)

@@ -35,7 +35,7 @@ class Constants:
         """Return the constant of a key; make it if it is missing.
 
         Raises:
-            HostReadError: the constant is missing, and the step before did not need it.
+            HostReadError: the constant is missing, and the previous step did not need it.
         """
         if key not in self._made:
             if self.complete:

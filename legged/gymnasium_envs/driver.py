@@ -49,7 +49,8 @@ class Driver:
         self.random = RandomStream(self.device)
         with self.random.used():
             self.task = make_task(cfg, self.device, graph=False)
-            # On a GPU the captured step includes the copies of final states; on the CPU no graph needs a check.
+            # On a GPU the captured step includes the copies of final states; on the CPU the step needs no check for a
+            # capture.
             self.final = keep_final_step(self.task, graph=self.device.type == "cuda")
             self._beginning = self._tried()
         self._seeded = False

@@ -110,8 +110,8 @@ class CapturedRunner(Runner):
 
     @property
     def _runs_ahead(self) -> bool:
-        """True if the next iteration is launched before the last one is logged. Several processes log in step, because all of
-        them must agree to stop.
+        """True if the next iteration is launched before the last one is logged. Several processes do not run ahead, because
+        all of them must agree to stop.
         """
         return torch.device(self.device).type == "cuda" and not self.is_distributed
 

@@ -101,7 +101,7 @@ class DeviceDistillation(Distillation):
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
         """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`; without
-        them, those of the last update are read from the device. The loss is NaN if no gradient was used.
+        `numbers`, the results of the last update are read from the device. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken

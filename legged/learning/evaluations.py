@@ -45,7 +45,8 @@ class Evaluated:
 
 
 class Ended(Exception):
-    """Error raised when an evaluation ends the training, at the end of an iteration, when networks and optimiser agree."""
+    """Error that ends the training after an evaluation. It is raised between iterations, when networks and optimiser are
+    consistent."""
 
 
 class Evaluations:

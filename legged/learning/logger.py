@@ -25,7 +25,7 @@ from legged.process.neighbours import Neighbours
 
 
 class Interrupted(Exception):
-    """Error raised when a training was asked to stop, at the end of an iteration, when networks and optimiser agree."""
+    """Error that stops a training on request. It is raised between iterations, when networks and optimiser are consistent."""
 
 
 class QuietLogger(Logger):

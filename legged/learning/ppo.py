@@ -199,7 +199,7 @@ class DevicePPO(CriticWarmup):
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
         """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`;
-        without them, those of the last update are read from the device.
+        without `numbers`, the results of the last update are read from the device.
 
         Losses are NaN if all mini-batches were skipped. The root mean square errors of the estimates follow as
         `Estimator/<term>_rmse`, each in the term's unit.

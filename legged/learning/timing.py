@@ -31,7 +31,8 @@ class Timing:
     loop_s: float
     """Time in iterations. It includes logging, except in rsl-rl's own loop [s]."""
     wall_s: float
-    """Time since the start of the process. It adds to the two above the capture of graphs, checkpoints and evaluations [s].
+    """Time since the start of the process [s]. It includes the two times above, the capture of graphs, checkpoints and
+    evaluations.
     """
     device: str
     kernels_compiled: int

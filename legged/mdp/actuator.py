@@ -340,8 +340,8 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that ideal motors are given no torque-speed line by mistake. A setting `ideal` is allowed over the numbers of a
-    file, so that the same motors can be tried without their line.
+    """Check that ideal motors are given no torque-speed line by mistake. The command line may set the model to `ideal` where
+    a file gives the numbers of a line, so that motors can be tried without it.
 
     Raises:
         ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and

@@ -24,8 +24,8 @@ def contact_force(mass: float) -> float:
 
 
 class FeetContacts:
-    """Contacts of F feet of N robots. A foot is in contact if it touches the ground now or did so a step before, so that a
-    single missed sample does not split a stance.
+    """Contacts of F feet of N robots. A foot is in contact if it touches the ground now or did so in the previous step, so
+    that a single missed sample does not split a stance.
     """
 
     STATE = ("_flags", "_times")

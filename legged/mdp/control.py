@@ -45,7 +45,7 @@ class Control:
         from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
-            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held without P.
+            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held by another law than P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:

@@ -63,7 +63,7 @@ class Video:
         if not (self.camera and self.folder):
             return
         self.camera.close()
-        if self.gif:  # first: it needs no encoder
+        if self.gif:  # written first, because it needs no encoder
             _write_gif(self.frames, self.folder / "play.gif", self.fps)
         write_mp4(self.frames, self.folder / "play.mp4", self.fps)
         print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")

@@ -66,7 +66,7 @@ class Layout:
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; empty takes the ONNX file's, or else the robot's."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    """Joint-name pattern -> D gain [N m s/rad]; empty as for `stiffness`."""
     torque_limits: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest torque [N m]; empty takes the robot's."""
     implicit_gains: bool = False
@@ -123,7 +123,7 @@ class ForeignPolicy:
         self.layout, self._path = layout, path
         try:
             options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = 1  # a policy of one robot is too small to be shared out
+            options.intra_op_num_threads = 1  # a policy of one robot is too small for several threads
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # its errors have no class in common
             raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error

@@ -157,7 +157,7 @@ def draw_figures(trials: Trials) -> list[Path]:
     import matplotlib.pyplot as plt
     from optuna.visualization import matplotlib as drawing
 
-    plt.switch_backend("agg")  # no window system is asked
+    plt.switch_backend("agg")  # draw without a window system
     plan, study = trials.plan, trials.study
     own = own_trial(plan, ranking(plan, trials.all))
     with warnings.catch_warnings():

@@ -49,7 +49,7 @@ def main(argv: list[str] | None) -> int:
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.kernels is not None and args.policy is not None:
-        raise ConfigError("--kernels: lists what is launched under random actions; leave it or --policy out")
+        raise ConfigError("--kernels: lists the launches under random actions; leave out either --kernels or --policy")
     settle_on(device)
     count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
     policy = policy_in(args, cfg)

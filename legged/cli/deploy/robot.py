@@ -104,7 +104,7 @@ def check_simulation(args: argparse.Namespace) -> None:
     """Check the numbers of the simulation's flags.
 
     Raises:
-        ConfigError: a number makes no sense.
+        ConfigError: a number is out of bounds.
     """
     largest = 0.0
     if args.terrain is not None:

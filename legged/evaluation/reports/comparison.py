@@ -97,7 +97,8 @@ def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
 
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
-    """Return the table of one engine: a line a measure, a column a run, and one for each difference from the first run."""
+    """Return the table of one engine: a line for each measure, a column for each run, and a column for each difference from
+    the first run."""
     rows: list[list[Cell]] = []
     for label, measure, difference in _measures(results):
         found = [measure(result) if result is not None else None for result in results]
@@ -206,7 +207,7 @@ def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
 
 
 def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
-    """Return a drawing a terrain type that at least two of the runs have crossed."""
+    """Return a drawing for each terrain type that at least two of the runs have crossed."""
     entries = [types_in(result or {}) for result in results]
     found = []
     for kind in dict.fromkeys(kind for one in entries for kind in one):

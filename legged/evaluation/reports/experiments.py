@@ -31,7 +31,7 @@ FORMS = {
     "loop [s]": ".1f",
     "steps/s": ",.0f",
 }
-"""Formats of the figures that rows shared by seeds average."""
+"""Formats of the figures that are averaged in a row of several seeds."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
 """Share of robots above which stairs count as crossed."""
@@ -115,8 +115,8 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest steps that robots crossed up and down, with all lower ones [m]; 0 if they did not
-    cross the lowest; None without an evaluation both ways.
+    """Return the height of the highest steps that robots crossed up and down, as they did all lower steps [m]; 0 if they did
+    not cross the lowest; None without an evaluation both ways.
     """
     types = result.get("success", {}).get("types", {})
     ways = [{point["size"]: point["share"] for point in types.get(name, {"points": []})["points"]} for name in STAIRS]
@@ -144,6 +144,6 @@ def _last(record: Record, tag: str) -> float | None:
 
 
 def _judged(record: Record) -> dict[str, Any] | None:
-    """Return the evaluation of a run in the first engine of ENGINES that has one."""
+    """Return a run's evaluation in the first engine of ENGINES in which it was evaluated."""
     order = [*ENGINES, *(result["physics"] for result in record.results)]
     return min(record.results, key=lambda result: order.index(result["physics"]), default=None)

@@ -45,7 +45,7 @@ NICENESS = 10
 FILMING: list[subprocess.Popen] = []
 """Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
-"""Most letters of a difference in the page; its file holds all of it."""
+"""Largest number of letters of a code difference in the page; its file holds the whole text."""
 OVER_TRAINING = (
     ("Train/mean_reward", "return", 1.0, ".2f"),
     ("Train/std_reward", "standard deviation of the return", 1.0, ".2f"),
@@ -192,7 +192,7 @@ def over_training(record: Record) -> Table:
 
 
 def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
-    """Return the last value of a curve up to an iteration; None before its first."""
+    """Return the last value of a curve up to an iteration; None before its first value."""
     before = np.flatnonzero(curve[0] <= step)
     return float(curve[1][before[-1]]) if len(before) else None
 
@@ -218,8 +218,8 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
     itself is complete.
 
     `film_with` holds the options by which another process finds the run's task. That process films the policy and writes the
-    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output. It
-    is another process because a driver that fails while it draws may end it, or never return.
+    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output.
+    The film has its own process because a graphics driver that fails may end the process, or hang.
     """
     start = time.perf_counter()
     try:

@@ -42,7 +42,8 @@ COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; robots have them in turn."""
+"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; they are given to the robots
+in turn."""
 HALF_STEP = "half the time step"
 """Name of the setting that LSTM actuators do not allow."""
 
@@ -136,7 +137,7 @@ class Bench:
         self.limit = LIMIT * sqrt(self.scale)
         """Largest error of a robot that follows its command [m/s]."""
         self.lost = 0
-        """Number of control steps in which a robot lost contacts for want of memory."""
+        """Number of control steps in which a robot lost contacts because memory was full."""
         self._policy, self._asked, self._device, self._graph = policy, tuple(asked), device, graph
 
     @property
@@ -161,7 +162,7 @@ class Bench:
         cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
         specs = [TileSpec(name, self.riser, self.tread) for name in STAIRS]
         outcomes, times = self._run_out(per_robot, specs, [cell, *changes])
-        # (up or down, line, robot) -> line by line
+        # From the order (up or down, line, robot) to rows of lines.
         outcomes, times = (values.view(2, len(rows), half).transpose(0, 1).flatten(1) for values in (outcomes, times))
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
 
@@ -219,7 +220,7 @@ class Bench:
         specs: Sequence[TileSpec],
         last: Sequence[tuple[str, Any]] = (),
     ) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
+        """Return the outcomes (N,) of robots that are distributed over tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self._asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))

@@ -152,7 +152,7 @@ def share_text(entry: dict[str, Any]) -> str:
 
 
 def draw_stress(result: dict[str, Any], path: Path) -> None:
-    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity error there."""
+    """Draw a bar for each line, with its interval: success, commands followed on the flat, and the velocity error there."""
     rows = rows_of(result)
     names = [name for _, name, *_ in rows]
     colors = [COLORS[kind] for kind, *_ in rows]
