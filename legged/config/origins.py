@@ -16,7 +16,8 @@ class Origins(dict[str, str]):
 
     def note(self, path: str, source: str) -> None:
         """Record that `source` set `path`, and remove the entries that it replaces: those of its parents and of its
-        children."""
+        children.
+        """
         for old in [key for key in self if key.startswith(f"{path}.") or path.startswith(f"{key}.")]:
             del self[old]
         self[path] = source

@@ -73,7 +73,8 @@ class JudgingTask:
 
     def _settled(self) -> dict[str, Tensor]:
         """Return by name the tensors that are written after `_start_terms`. Before that, they hold values of the last
-        step."""
+        step.
+        """
         named = {name: getattr(self, name) for name in SETTLED}
         found = zip(self.terminations.names, self.terminations.found, strict=True)
         return named | {f"terminations.found of '{name}'": tensor for name, tensor in found}

@@ -68,7 +68,8 @@ def spread(values: Sequence[float]) -> float:
 
 def tracking_table(groups: Evaluations) -> Table:
     """Return a table with one column for each group: the mean over its seeds, and the distance of the farthest seed from
-    it."""
+    it.
+    """
     rows = []
     for label, name, part, factor, form in FIGURES:
         row = [label]
@@ -161,7 +162,8 @@ def success_table(groups: Evaluations) -> Table:
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
     """Draw success into a PNG file: a panel for each terrain type, a line for each group, with a band from the worst to the
-    best seed."""
+    best seed.
+    """
     charts = []
     for name in types_of(groups):
         lines = []

@@ -80,7 +80,8 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:
     """Draw success over size with its intervals into a PNG file: a panel for each kind of terrain, a line for each type and
-    engine."""
+    engine.
+    """
     rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
     text = (
         f"{results[0]['task']}: robots that get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"

@@ -229,7 +229,8 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that `networks` gives, for a checkpoint that lacks them, as far as the weights in `state` show
-    them."""
+    them.
+    """
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")

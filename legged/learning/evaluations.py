@@ -46,7 +46,8 @@ class Evaluated:
 
 class Ended(Exception):
     """Error that ends the training after an evaluation. It is raised between iterations, when networks and optimiser are
-    consistent."""
+    consistent.
+    """
 
 
 class Evaluations:

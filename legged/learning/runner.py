@@ -368,7 +368,8 @@ class Runner(OnPolicyRunner):
 
     def _episodes(self) -> dict[str, Tensor]:
         """Return the sum of rewards and the length so far of each environment's episode, (N,) each, as counted for the
-        log."""
+        log.
+        """
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 
     def _memory(self) -> dict[str, Tensor]:

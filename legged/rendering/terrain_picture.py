@@ -141,7 +141,8 @@ def _outline(terrain: Terrain) -> np.ndarray:
 
 def _label_at(terrain: Terrain, place: Place) -> np.ndarray:
     """Return the position (3,) of a place's label [m]: behind its tile in the farthest row, and on the near edge of other
-    tiles."""
+    tiles.
+    """
     x, y, _ = terrain.origins[place.row, place.col]
     last = len(terrain.origins) - 1
     if place.row == last > 0:

@@ -89,7 +89,9 @@ def evaluate(argv: list[str] | None) -> int:
     settling = grid.settle_s if grid else SETTLING_S
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
     if not settling < seconds <= 1000.0:
-        raise ConfigError(f"--seconds: must be above {settling:g}, in which the robot settles, and at most 1000, got {seconds}")
+        raise ConfigError(
+            f"--seconds: must be above {settling:g}, in which the robot settles, and at most 1000, got {seconds}"
+        )
     if not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [_command(text) for text in args.command or ()] or COMMANDS

@@ -98,7 +98,8 @@ def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
     """Return the table of one engine: a line for each measure, a column for each run, and a column for each difference from
-    the first run."""
+    the first run.
+    """
     rows: list[list[Cell]] = []
     for label, measure, difference in _measures(results):
         found = [measure(result) if result is not None else None for result in results]

@@ -101,7 +101,8 @@ def _one(
     level: tuple[str, float] | None = None,
 ) -> list[Chart]:
     """Return the chart of one quantity, a line for each run, as running means unless `exact`; no chart if no run logged
-    it."""
+    it.
+    """
     lines = []
     for i, (label, run) in enumerate(runs):
         steps, values = run.scalars.get(tag, (np.array([]), np.array([])))

@@ -123,7 +123,8 @@ class Record:
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
         """Return the checkpoint of an evaluation; an empty text if it is the last checkpoint, which all other figures
-        describe."""
+        describe.
+        """
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
 
