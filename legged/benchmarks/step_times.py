@@ -63,7 +63,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # it takes minutes on a CPU
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # takes minutes on a CPU
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
     turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]

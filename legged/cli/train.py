@@ -300,7 +300,7 @@ def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> N
     """
     if not cfg.train.runner.report:
         return
-    from legged.evaluation.reports.run_report import report_at_end  # imported late, because a start does not need it
+    from legged.evaluation.reports.run_report import report_at_end  # imported late: no training needs it at its start
 
     film_with = None
     if args is not None and cfg.train.runner.film:

@@ -75,7 +75,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
     if not policy.estimator.targets:
         if policy.estimator.latent:
             where = origins.where("train.policy.estimator.latent")
-            raise ConfigError(f"{where}: must be 0 without an estimator; {path}=[base_lin_vel] makes one")
+            raise ConfigError(f"{where}: must be 0 without an estimator; {path}=[base_lin_vel] adds one")
         return
     if ESTIMATED in cfg.observations.groups:
         where = origins.where(f"observations.groups.{ESTIMATED}")

@@ -85,11 +85,11 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
     Log.check(args.log)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
+    if args.robot in KINDS:  # refuse a policy that does not fit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
-    hurries = take_priority()  # before a robot's SDK starts threads, which inherit it
+    hurries = take_priority()  # before a robot's SDK starts threads, which inherit the priority
     try:
         robot = _connect(args)
         operator.take()

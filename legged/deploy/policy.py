@@ -34,7 +34,7 @@ class Network:
             options.intra_op_num_threads = options.inter_op_num_threads = 1  # too small for several threads
             options.log_severity_level = 3
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no class in common
+        except Exception as error:  # errors of onnxruntime have no common class
             raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
         self._path, self._memory = path, contract.memory
         self._check(contract)

@@ -112,7 +112,7 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None, flag: str =
         numbers = [i for i in numbers if ended_by in figures.ended[i]]
     if by == FELL:
         rest = figures.values.get("tracking", -figures.values["return"])
-        # Among those that failed the shortest first, among the others the worst.
+        # Failed episodes come first, sorted by length, then the others by tracking error or return.
         length = figures.values["length"]
         return sorted(numbers, key=lambda i: (0, length[i]) if figures.failed[i] else (1, -_or_worst(rest[i])))
     column = next(column for column in COLUMNS if column.name == by)

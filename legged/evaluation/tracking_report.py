@@ -62,7 +62,7 @@ def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing
+        warnings.simplefilter("ignore", RuntimeWarning)  # mean of no values
         return np.nanmean(values, axis=over)
 
 

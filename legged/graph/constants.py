@@ -75,7 +75,7 @@ class Constants:
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
             raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
         if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
-            return index  # torch takes most of these for tuples and warns
+            return index  # torch interprets most sequences as tuples and warns
         pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 

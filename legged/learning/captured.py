@@ -94,7 +94,7 @@ class CapturedRunner(Runner):
             unlogged = launched
             saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
             evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
-            # The last but one is logged at once, so that a request to stop takes effect before the training is complete.
+            # The second-last iteration is logged at once, so that a request to stop takes effect before the last one.
             if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
                 self._log(launched)
                 unlogged = None

@@ -117,7 +117,7 @@ class QuietLogger(Logger):
                 super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         finally:
             self.device = device
-        self.ep_extras.clear()  # rsl-rl clears them only where it writes, in the first process
+        self.ep_extras.clear()  # rsl-rl clears the episode infos only in the first process, which writes them
         self.divergence.update(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time

@@ -76,7 +76,7 @@ def write_mp4(frames: list[np.ndarray], path: Path, fps: float) -> None:
         RunError: the film cannot be written.
     """
     try:
-        import imageio_ffmpeg  # nothing but a film needs it
+        import imageio_ffmpeg  # only films need imageio
 
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:

@@ -125,7 +125,7 @@ class ForeignPolicy:
             options = onnxruntime.SessionOptions()
             options.intra_op_num_threads = 1  # a policy of one robot is too small for several threads
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # its errors have no class in common
+        except Exception as error:  # errors of onnxruntime have no common class
             raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
         self.metadata = said = dict(self._session.get_modelmeta().custom_metadata_map)
         joints = list(layout.joints or _listed(said, JOINTS, str(path)) or robot.joint_names)

@@ -52,14 +52,14 @@ class Neighbours:
         for folder in (self._folder.parent, self._folder):
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
-                folder.chmod(0o1777)  # for every user, as the folder around it
+                folder.chmod(0o1777)  # writable for every user, like its parent folder
         if not (self._folder / TURN).exists():
             (self._folder / TURN).touch(0o644)
         descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
         self._lock = os.fdopen(descriptor, "wb")
         os.chmod(name, 0o644)
         lock_descriptor(descriptor, blocking=False)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees it
+        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
 
     def glance(self) -> None:
         """Count the others, unless the last count was a moment ago."""

@@ -79,7 +79,7 @@ class Trials:
                     self.study.enqueue_trial(own, skip_if_exists=True)
         except ConfigError:
             raise
-        except Exception as error:  # of SQLAlchemy, drivers and file systems, each of its own kind
+        except Exception as error:  # SQLAlchemy, drivers and file systems raise their own classes
             raise RunError(f"sweep: the storage can't be used: {' '.join(str(error).split())[:300]}") from error
         if known not in (None, plan.identity):
             raise ConfigError(
@@ -145,7 +145,7 @@ class Trials:
         taken = []
         for trial in self._running():
             said = trial.user_attrs.get(ALIVE)
-            if said is None and trial.datetime_start is not None:  # it has just begun
+            if said is None and trial.datetime_start is not None:  # a trial without a confirmation has just begun
                 said = trial.datetime_start.timestamp()
             if is_dead(trial.user_attrs.get(OWNER), said) and self.try_again(trial, "its process was killed"):
                 taken.append(trial.number)

@@ -157,7 +157,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         start_new_session=True,  # Ctrl-C is for the program, which stops the robot safely first
     )
     program = None
-    if in_main_thread():  # a signal to this process is meant for all three
+    if in_main_thread():  # a signal to this process ends the other two as well
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None

@@ -228,7 +228,7 @@ class _Frame:
         self._keys: list[str] = []
         self._places: list[tuple[float, int]] = []
         left, row = LEFT, 0
-        for name in names:  # a new row of the legend where the last one has no room
+        for name in names:  # a new row of the legend if the last row has no room
             width = 28.0 + LETTER * len(name)
             left, row = (LEFT, row + 1) if left + width > WIDTH - 2.0 and left > LEFT else (left, row)
             self._places.append((left, row))

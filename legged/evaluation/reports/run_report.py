@@ -240,7 +240,7 @@ def _film_apart(folder: Path, options: Sequence[str]) -> str:
         return "no film: nothing can be drawn"
     command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *options]
     alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
-    alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
+    alone["CUDA_VISIBLE_DEVICES"] = ""  # the film is drawn on the CPU, because a GPU's memory may be full
     alone["LP_NUM_THREADS"] = "1"  # threads of Mesa, which draws without a GPU
     FILMING[:] = [process for process in FILMING if process.poll() is None]
     try:

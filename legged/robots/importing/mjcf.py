@@ -103,7 +103,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     try:
         return spec.compile()
     except Exception as error:
-        for key in list(spec.keys):  # keyframes of another size were written for a scene with more in it
+        for key in list(spec.keys):  # keyframes of another size belong to a scene with more joints
             spec.delete(key)
         try:
             return spec.compile()
