@@ -116,8 +116,9 @@ def check_ranges(
     Raises:
         ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for
             example because it leaves no mass.
-    """ model = scene.model(sim, "none") if ranges else None  # without the ground, which no field changes and which takes
-    long to build for name in ranges:
+    """
+    model = scene.model(sim, "none") if ranges else None  # without the ground, which no field changes
+    for name in ranges:
         if name not in FIELDS:
             path = where("domain_rand.ranges")
             raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")

@@ -72,8 +72,10 @@ class Motors:
         self._random, self._range, self._ratio = np.random.default_rng(seed), cfg.delay, counted / dt
         self._varies = cfg.delay_varies
         self.delay = self._draw()
-        """Present delay of a command [steps].""" self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  #
-        from the command that has arrived to the newest one self._network: ActuatorNetwork | None = None if cfg.network:
+        """Present delay of a command [steps]."""
+        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # from the last arrived command on
+        self._network: ActuatorNetwork | None = None
+        if cfg.network:
             weights = NetworkWeights.load(cfg.network)
             self._network = ActuatorNetwork(weights, 1, robot.num_dof, dt, torch.device("cpu"))
             self._by_network = np.isin(np.arange(robot.num_dof), modelled_joints(robot, cfg))
