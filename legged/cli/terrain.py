@@ -31,7 +31,7 @@ def build_parser() -> CommandParser:
     )
     add_task_arguments(parser)
     parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
-    parser.add_argument("--difficulty", type=float, default=0.5, help="of the tiles in the picture, 0 to 1")
+    parser.add_argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
     return parser
 

@@ -65,13 +65,13 @@ class _Layer:
     name: str
     """Name in errors."""
     folder: Path
-    """Folder to which its paths are relative."""
+    """Folder to which the paths in the settings are relative."""
     task: str | None
     """Name of the registered task; None for a file."""
     kind: Any
-    """Class of the task that it names, or None."""
+    """Value of `class:`, or None."""
     reference_robot: Any
-    """Robot for which its numbers are written, or None for any robot."""
+    """Robot for which the numbers are written, or None for any robot."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
@@ -136,7 +136,7 @@ class ClassHint:
     """Class of the task according to one configuration of a chain."""
 
     where: str
-    """Beginning of errors about it."""
+    """Beginning of errors about this hint."""
     task: str | None
     """Name of the registered task, which may have a class; None for a file."""
     kind: Any

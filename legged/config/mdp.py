@@ -77,7 +77,8 @@ class ObservationsConfig:
     """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
-    """Group -> its content. The group `actor` is the policy's by default; `train.policy` sets the groups of each network."""
+    """Group -> terms, history and noise of the group. The group `actor` is the policy's by default; `train.policy` sets the
+    groups of each network."""
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
     """Term -> factor; 1 for other terms."""
     add_noise: bool = True

@@ -35,7 +35,7 @@ SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
 MOMENT = struct.Struct("@ll")
 """Seconds and microseconds."""
 SET_S = 0.01
-"""Change of the difference between this machine's two clocks that shows that its time of day was set [s]."""
+"""Smallest change of the difference between this machine's two clocks that counts as a reset of its time of day [s]."""
 SOURCE_AGE_S = 0.2
 """Age at which the value of a source expires, by this machine's clock, since a robot may have none [s]."""
 

@@ -132,7 +132,7 @@ def check_sizes(cfg: TaskConfig) -> None:
     if robots * steps > MOST_SAMPLES:
         raise ConfigError(
             f"{cfg.origins.where('train.runner.num_steps_per_env')}: {steps} steps of {robots} robots (env.num_envs:"
-            f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples an iteration, more than {MOST_SAMPLES:,}"
+            f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples per iteration, more than {MOST_SAMPLES:,}"
         )
     policy = cfg.train.policy
     for field, widths in (

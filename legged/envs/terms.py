@@ -265,7 +265,7 @@ class Terms:
     @concurrent
     @unit("rad/s")
     def _reward_dof_vel_limits(self) -> Tensor:
-        """Joint speeds beyond their soft limits, at most 1 rad/s a joint [rad/s]."""
+        """Joint speeds beyond their soft limits, at most 1 rad/s for each joint [rad/s]."""
         limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
         return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
 

@@ -32,7 +32,7 @@ BUDGET_MB = 3.0
 
 
 class Projector:
-    """Renderer of recorded episodes; builds their task once, with one robot in the C engine."""
+    """Renderer of recorded episodes. The task of the episodes is built once, with one robot in the C engine."""
 
     def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
         """Build the task that `cfg` describes, on the ground of the episodes.

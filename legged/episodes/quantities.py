@@ -22,12 +22,12 @@ class Quantity:
 
     name: str
     read: Callable[[], Tensor]
-    """Return its current values (N, ...)."""
+    """Return the current values (N, ...)."""
     unit: str
     what: str
-    """Description, with the frame if it has one."""
+    """Description, with the frame if the quantity has one."""
     columns: tuple[str, ...] = ()
-    """Names along its second axis, if it has one."""
+    """Names along the second axis of the values, if there is one."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Joint:
 
     name: str
     unit: str
-    """Unit of its position: rad, or m for a slide."""
+    """Unit of the joint's position: rad, or m for a slide."""
     qpos: int
     """Column of the generalised positions."""
     qvel: int

@@ -8,7 +8,7 @@ from legged.errors import ConfigError
 from legged.evaluation.json_forms import INDEX, NUMBER, POSITIVE, TEXT, OrNull, check_form, wrong_form
 
 FORMAT = 1
-"""Version of episodes.json; it grows when older files can no longer be read."""
+"""Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = {
     "episode_start": "first row of every episode, and behind the last one",
     "robot": "robot that ran it",

@@ -25,7 +25,7 @@ from legged.registry import make_task, task_class
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""
 SETTLE_S = 1.0
-"""Time at its start in which errors are not measured; at most a third of a shorter hold [s]."""
+"""Time at the start of a command in which errors are not measured; at most a third of a shorter hold [s]."""
 
 
 def few_commands(cfg: LeggedConfig) -> Grid:

@@ -13,7 +13,7 @@ class Engine:
 
     label: str
     line: str
-    """Line style of its curves, as in matplotlib."""
+    """Line style of the engine's curves, as in matplotlib."""
     marker: str
     overrides: Sequence[tuple[str, Any]] = ()
     """Settings that choose it."""

@@ -1,4 +1,4 @@
-"""Constants of a control step: its Python numbers as tensors that are on the device before a CUDA graph is captured."""
+"""Constants of a control step: Python numbers as tensors that are on the device before a CUDA graph is captured."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -255,4 +255,4 @@ class LaunchedIteration:
     """Iterations of the whole training, including those of the run that this one resumes."""
     readback: AsyncReadback
     clock: Clock
-    """Laps of its rollout and its update."""
+    """Clock with the times of the rollout and of the update."""

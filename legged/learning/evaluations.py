@@ -25,7 +25,7 @@ class Measurement(Protocol):
 
     @property
     def figures(self) -> Sequence[str]:
-        """Names of the figures that it measures, the most important one first."""
+        """Names of the measured figures, the most important one first."""
 
     def measure(self, policy: nn.Module) -> dict[str, float]:
         """Measure a policy and return figure -> value."""

@@ -36,7 +36,7 @@ class Timing:
     """
     device: str
     kernels_compiled: int
-    """Modules of Warp kernels that its cache lacked."""
+    """Number of Warp modules that were compiled, because Warp's cache lacked them."""
     beside: int = 0
     """Largest number of other trainings seen at one time on the same device; with several GPUs, on that of the first process.
     """

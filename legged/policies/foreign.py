@@ -58,9 +58,10 @@ class Layout:
     action_clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Largest action."""
     joints: tuple[str, ...] = ()
-    """The policy's joints in its order; empty takes those that the ONNX file names, or else the robot's."""
+    """Joints in the policy's order; empty takes the joints that the ONNX file names, or else the robot's."""
     action_joints: tuple[str, ...] = ()
-    """Those of them that have an action, in its order; the others stay at their default angles. Empty takes all."""
+    """Joints that have an action, in the order of the actions; the others stay at their default angles. Empty takes all
+    joints."""
     default_joint_angles: dict[str, float] = field(default_factory=dict, metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]; empty takes the robot's."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))

@@ -28,9 +28,11 @@ class Neighbours:
     """
 
     def __init__(self, device: str) -> None:
-        """`device` is its unique name on the machine, such as a GPU's UUID, whatever numbers processes give to devices."""
+        """Take the unique name of the `device` on this machine, such as a GPU's UUID. It does not depend on the numbers that
+        processes give to devices.
+        """
         self.most = 0
-        """Largest number of others seen at one time."""
+        """Largest number of other trainings seen at one time."""
         self._folder = Path(tempfile.gettempdir()) / FOLDER / device
         self._path: Path | None = None
         self._lock: IO[bytes] | None = None

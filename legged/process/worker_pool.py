@@ -36,7 +36,7 @@ class Job:
     kind: Kind
     command: list[str]
     output: Path
-    """File for its standard output and errors."""
+    """File for the process's standard output and errors."""
     done: Callable[["Job", int], Iterable["Job"]]
     """Function that is called with the job and its exit code, and returns the jobs that follow."""
     told: bool = False

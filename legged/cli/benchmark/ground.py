@@ -31,7 +31,7 @@ def build_parser() -> CommandParser:
         "legged benchmark ground go2 --num-envs 2048 --out times",
     )
     add_arguments(parser)
-    parser.add_argument("--steps", type=int, default=200, help="control steps a measurement; 200 by default")
+    parser.add_argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default")
     return parser
 
 

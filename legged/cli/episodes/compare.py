@@ -38,7 +38,7 @@ def build_parser() -> CommandParser:
         "legged episodes compare logs/episodes/anymal_c logs/episodes/anymal_c_blind --out comparison",
     )
     parser.add_argument("policy", metavar="POLICY", help=SOURCE_HELP)
-    parser.add_argument("other", metavar="POLICY", help="the other one")
+    parser.add_argument("other", metavar="POLICY", help="second policy, or folder of recorded episodes")
     add_recording_arguments(parser)
     parser.add_argument("--out", type=Path, help="folder for all files; logs/episodes/compare by default")
     return parser

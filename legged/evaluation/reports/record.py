@@ -69,7 +69,7 @@ class Record:
     timing: Timing | None
     scalars: Scalars
     results: tuple[dict[str, Any], ...]
-    """Evaluations, one an engine."""
+    """Evaluations, one for each engine."""
     code: Code
     note: str
     """Note of the user."""
@@ -130,7 +130,7 @@ class Record:
 
     @property
     def film(self) -> Path | None:
-        """Film of its policy, if there is one."""
+        """Film of the run's policy, if there is one."""
         return next((path for name in FILMS if (path := self.folder / name).is_file()), None)
 
 

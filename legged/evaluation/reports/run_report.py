@@ -34,7 +34,7 @@ from legged.process.paths import relative
 from legged.process.processes import child_environment
 
 REPORT = "report"
-"""Name of its files, before their ending."""
+"""Name of the report's files, before their ending."""
 ROWS = 10
 """Rows of the table over training."""
 LARGEST_FILM = 12 * 2**20

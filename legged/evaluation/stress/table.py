@@ -7,7 +7,7 @@ from typing import Any
 from legged.robots.similarity import Size, grown
 
 WRITTEN_FOR = "anymal_c"
-"""Robot of the numbers below; they are scaled for others."""
+"""Robot for which the numbers below are written. They are scaled for other robots."""
 
 
 @dataclass(frozen=True)

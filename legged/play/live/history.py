@@ -32,7 +32,7 @@ class Sample:
 
 
 class History:
-    """Samples of one robot, one a control step, oldest first."""
+    """Samples of one robot, one for each control step, oldest first."""
 
     def __init__(self, task: BaseTask) -> None:
         """Keep KEPT_S of a task's robot."""

@@ -62,15 +62,15 @@ class Hinge:
     range: tuple[float, float] | None = None
     """[rad]; None for a hinge without limits."""
     effort: float | None = None
-    """Torque limit of its motor [N m]; None if the file states none."""
+    """Torque limit of the hinge's motor [N m]; None if the file states none."""
     velocity: float | None = None
     """Speed limit [rad/s]."""
     driven: bool = True
-    """True if it has a motor."""
+    """True if the hinge has a motor."""
     stiffness: float | None = None
     """P gain of a position actuator [N m/rad]."""
     damping: float | None = None
-    """D gain of its actuators [N m s/rad]."""
+    """D gain of the hinge's actuators [N m s/rad]."""
     passive: dict[str, float] = field(default_factory=dict)
     """MJCF attributes of the joint itself: damping, armature, frictionloss, stiffness, springref."""
 
