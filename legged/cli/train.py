@@ -89,9 +89,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--note", help="a sentence about this run, for its report and the table of all runs")
     parser.add_argument("--rl-device", help="device of the networks; that of the simulation by default")
     parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
-    parser.add_argument(
-        "--headless", action="store_true", help="without effect, because training draws nothing; legged_gym has this option"
-    )
+    parser.add_argument("--headless", action="store_true", help="without effect; legged_gym has this option")
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )

@@ -120,21 +120,17 @@ def _main(argv: list[str] | None) -> int:
 def add_program_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the program that do not depend on the robot."""
     standard = {field.name: field.default for field in fields(Limits)}
-    parser.add_argument(
-        "--input", choices=("keyboard", "gamepad"), default="keyboard", help="source of commands; default keyboard"
-    )
+    parser.add_argument("--input", choices=("keyboard", "gamepad"), default="keyboard", help="commands; default keyboard")
     parser.add_argument("--gamepad", type=Path, default=gamepad.DEVICE, help=f"device; default {gamepad.DEVICE}")
     parser.add_argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad")
     parser.add_argument(
         "--seconds", type=float, default=float("inf"), help="end after this time [s]; by default when the operator quits"
     )
     parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
-    parser.add_argument("--max-tilt", type=float, help=f"stop beyond this tilt [rad]; default {standard['max_tilt']:g}")
+    parser.add_argument("--max-tilt", type=float, help=f"largest tilt [rad]; default {standard['max_tilt']:g}")
+    parser.add_argument("--max-age", type=float, help=f"largest age of data [s]; default {standard['max_age_s']:g}")
     parser.add_argument(
-        "--max-age", type=float, help=f"stop if the newest data are older [s]; default {standard['max_age_s']:g}"
-    )
-    parser.add_argument(
-        "--max-missed", type=int, help=f"stop after so many missed deadlines in a row; default {standard['max_missed']}"
+        "--max-missed", type=int, help=f"largest number of deadlines missed in a row; default {standard['max_missed']}"
     )
 
 

@@ -108,7 +108,7 @@ class Panels:
         return _section("Feet", panels, note, wide=True)
 
     def _passive(self) -> dict[str, Any] | None:
-        """Return the positions of joints without a motor, of a legged robot."""
+        """Return the positions of a legged robot's joints without a motor."""
         if "command" not in self.one:
             return None
         names = self.episodes.columns("qpos")
@@ -123,7 +123,7 @@ class Panels:
     # ---- all tasks --------------------------------------------------------------------------------------------------
 
     def _of_root(self) -> dict[str, Any]:
-        """Return the coordinates without a motor, of any other task."""
+        """Return the coordinates that no motor drives, for a task without a legged robot."""
         panels = []
         for name, key, title, unit in (
             ("qvel", "qvel", "velocities without a motor", "m/s or rad/s"),

@@ -192,7 +192,9 @@ def checked_size(width: int, height: int) -> tuple[int, int]:
 
 
 def as_numpy(value: Any) -> Any:
-    """Return a tensor, or the tensors of a dictionary, as arrays; those of tensors on the CPU share their memory."""
+    """Return a tensor, or the tensors of a dictionary, as arrays. The array of a tensor on the CPU shares the tensor's
+    memory.
+    """
     if isinstance(value, dict):
         return {name: as_numpy(part) for name, part in value.items()}
     return value.cpu().numpy() if isinstance(value, Tensor) else value

@@ -37,7 +37,7 @@ def add_step_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the timed steps and iterations."""
     parser.add_argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default")
     parser.add_argument(
-        "--iterations", type=int, help="timed iterations of each training loop; 20 by default, 3 on the CPU, 0 for none"
+        "--iterations", type=int, help="timed iterations of each loop; 20 by default, 3 on the CPU, 0 for none"
     )
     parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
     parser.add_argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it")

@@ -91,13 +91,13 @@ def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
         "--cell",
         type=float,
         default=0.1,
-        help="edge of the tile's cells [m]; a tread is a whole number of cells; default 0.1",
+        help="edge of the tile's cells [m]; treads are whole cells; default 0.1",
     )
     parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
     parser.add_argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0")
     parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
     parser.add_argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1")
-    parser.add_argument("--ideal-motors", action="store_true", help="whatever the policy was trained with")
+    parser.add_argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with")
     parser.add_argument(
         "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
     )

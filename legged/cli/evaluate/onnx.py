@@ -70,9 +70,7 @@ def build_parser() -> CommandParser:
         "--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"
     )
     for axis, unit in AXES.items():
-        parser.add_argument(
-            f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another axis is given"
-        )
+        parser.add_argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another one is given")
     parser.add_argument("--seconds", type=float, help=f"length of each command; {SECONDS:g}, of a grid's {HOLD_S:g}")
     parser.add_argument("--friction", type=float, default=0.8, help="between robot and ground; 0.8 by default")
     parser.add_argument("--rmse", type=float, help="largest mean velocity RMSE of a grid that is followed [m/s]")
