@@ -133,4 +133,4 @@ def check_comparable(one: JointStatistics, other: JointStatistics) -> None:
     if one.joints != other.joints:
         only = [name for name in (*one.joints, *other.joints) if (name in one.joints) != (name in other.joints)]
         differing = ", ".join(only[:4]) or "in another order"
-        raise ConfigError(f"POLICY: the two have other joints ({differing}); take policies of one robot")
+        raise ConfigError(f"POLICY: the two have other joints ({differing}); name policies of the same robot")

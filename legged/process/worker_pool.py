@@ -72,7 +72,7 @@ class Job:
 class WorkerPool:
     """Pool that runs jobs until the queue is empty. A job that fails does not end the others.
 
-    Trainings start in the order of the queue. Each starts when the one before it has built its task, so that start-up
+    Trainings start in the order of the queue. Each starts when the previous training has built its task, so that start-up
     overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
     """
 

@@ -124,7 +124,7 @@ def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     """
     if given is not None:
         return load_robot(given, "--robot")
-    for folder in exported.absolute().parents[:2]:  # the run of an exported single checkpoint, or of the export of all
+    for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels up
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
             if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:

@@ -162,7 +162,7 @@ class Tree:
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Make the pose of a link at zero angles the one that `hinge` gives it at `angle` [rad]. The hinges of the link before
+    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. The hinges of the link before
     that one stay where they are, and their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
