@@ -181,7 +181,7 @@ def _merged(
             if not isinstance(layer.reference_robot, str):
                 raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.reference_robot)}")
             rescaled: Mapping[str, Any] = data
-            if rescale is not None and isinstance(robot, str):  # other values are refused with the command line
+            if rescale is not None and isinstance(robot, str):  # a wrong type of `robot` is refused later
                 reference = robot_path(layer.reference_robot, layer.folder)
                 rescaled = rescale(data, reference, robot, where)
                 origins.reference_robots = tuple(dict.fromkeys([*origins.reference_robots, reference]))

@@ -58,7 +58,9 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
     rewards = task.rewards
     found = [
         Quantity("qpos", lambda: physics.qpos, "m, rad", "generalised positions in MuJoCo's layout", _coordinates(model, 0)),
-        Quantity("qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, likewise", _coordinates(model, 1)),
+        Quantity(
+            "qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities in MuJoCo's order", _coordinates(model, 1)
+        ),
         Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
         Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; below 0 it may have been cut off"),
         Quantity("reward_parts", lambda: rewards.last.t(), "1", "scale times term of this step", rewards.names),

@@ -35,7 +35,7 @@ LOGGED = "log/"
 
 
 class CapturedRunner(Runner):
-    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once an iteration.
+    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once per iteration.
 
     On a GPU it launches the next iteration before it logs the last one, so the device never waits for the log. Checkpoints,
     configuration and logs are those of Runner. Where a feature needs rsl-rl's own loop (`why_stock`), `learn` is Runner's.

@@ -20,7 +20,7 @@ from legged.learning.recurrent import Memory
 class DeviceDistillation(Distillation):
     """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for recurrent and other students.
 
-    The differences from rsl-rl are these. Losses are summed on the device and read once an iteration. A student without
+    The differences from rsl-rl are these. Losses are summed on the device and read once per iteration. A student without
     recurrent layers learns from all steps of a gradient in one batch. The optimiser is fused. A recurrent teacher keeps its
     hidden state from one iteration to the next, while rsl-rl resets it. With `stock`, rsl-rl's own update and loop run.
     """

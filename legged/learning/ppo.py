@@ -31,7 +31,7 @@ class DevicePPO(CriticWarmup):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
     The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
-    memory once an update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
+    memory once per update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
     divergence are written out. The optimiser is fused. Losses are summed on the device and read once. An actor's estimator
     learns from the same mini-batches. Where a feature needs rsl-rl's own update (`why_stock`), that one runs.
     """

@@ -138,7 +138,7 @@ class NetworkWeights:
 
 
 class ActuatorNetwork:
-    """Learned actuator, evaluated once a physics step for all D joints of all N robots."""
+    """Learned actuator, evaluated once per physics step for all D joints of all N robots."""
 
     def __init__(
         self,

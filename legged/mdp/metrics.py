@@ -1,4 +1,4 @@
-"""Means that are logged of a rollout, accumulated on the device without synchronisation."""
+"""Means for the log of a rollout, accumulated on the device without synchronisation."""
 
 from collections.abc import Callable, Mapping, Sequence
 

@@ -36,7 +36,7 @@ class NanGuard:
         self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
         self._seen = torch.zeros_like(self._now)
         self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
-        # The largest size of each observation column, which costs two launches a step. `flush` counts the robots.
+        # Largest size of each observation column. It costs two launches per step. `flush` counts the robots.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:

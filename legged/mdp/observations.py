@@ -1,4 +1,4 @@
-"""Observation groups: named terms, each evaluated once a step, then scaled, given noise, clipped and concatenated."""
+"""Observation groups: named terms, each evaluated once per step, then scaled, given noise, clipped and concatenated."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from legged.mdp.random_pool import RandomPool
 
 
 class ObservationTerms:
-    """Observation terms of all groups of a task, each evaluated once a step, then concatenated."""
+    """Observation terms of all groups of a task, each evaluated once per step, then concatenated."""
 
     def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
         """Call the function of each term once, to learn its width. Each returns (N, width).

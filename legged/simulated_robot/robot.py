@@ -20,7 +20,7 @@ OFFERS = frozenset({"base_lin_vel", "heights"})
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 """Warnings of MuJoCo that accompany a reset of the state."""
 FALLEN = 1.2
-"""Lean of the base above which the robot has fallen [rad]."""
+"""Tilt of the base above which the robot has fallen [rad]."""
 
 
 class SimulatedRobot:
