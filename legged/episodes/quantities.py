@@ -59,7 +59,7 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
     found = [
         Quantity("qpos", lambda: physics.qpos, "m, rad", "generalised positions in MuJoCo's layout", _coordinates(model, 0)),
         Quantity(
-            "qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities in MuJoCo's order", _coordinates(model, 1)
+            "qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, MuJoCo's layout", _coordinates(model, 1)
         ),
         Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
         Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; below 0 it may have been cut off"),

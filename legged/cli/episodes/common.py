@@ -70,9 +70,7 @@ def wish_of(args: argparse.Namespace) -> Wish:
             raise ConfigError(f"--{option}: must be {limit}, got {value:,}")
     robots = args.num_envs if args.num_envs is not None else min(args.episodes, MOST_ROBOTS)
     if robots > args.episodes:
-        raise ConfigError(
-            f"--num-envs: {robots} robots have no more than {args.episodes} episodes to run (--episodes); each robot runs at least one"
-        )
+        raise ConfigError(f"--num-envs: {robots} robots have no more than {args.episodes} episodes to run (--episodes)")
     command = None if args.command is None else _command(args.command)
     changes = tuple(policy_overrides(args))
     return Wish(args.episodes, robots, args.as_trained, command, args.terrain, args.difficulty, changes)
