@@ -143,7 +143,7 @@ class UdpRobot(Interface):
                 )
             )
         if found and not self._asked <= found[-1].sources.keys():
-            self._send(self._greeting)  # the first one may be lost
+            self._send(self._greeting)  # the first greeting may be lost
         return found
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:

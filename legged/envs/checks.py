@@ -19,7 +19,7 @@ FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
 default.
 """
 RETURNING = ("return", "falls", "episode_length")
-"""The same for other tasks."""
+"""Figures of evaluations during training, for tasks without commands. The first one chooses the best policy by default."""
 MOST_IN_A_POOL = 2**31 - 1
 """Largest number of contacts, or of constraint rows, of all robots. Engines count them in 32 bits."""
 MOST_SAMPLES = 2**28

@@ -197,7 +197,8 @@ def joint_unit(array: str, of_position: str) -> str:
 
 def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
     """Return the groups of joints whose names differ only in the words for a leg (`SIDES`), in order: their common name, and
-    their numbers. A joint without others is a group, and so is each of more than `MOST_LINES`.
+    their numbers. A joint without such partners is a group of its own. Joints of a group with more than `MOST_LINES` form
+    separate groups.
     """
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):

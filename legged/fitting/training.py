@@ -71,7 +71,8 @@ def _spread(values: np.ndarray) -> float:
 
 
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the indices of training samples with at least `past` samples before them in the same run, none held out.
+    """Return the indices of training samples with at least `past` samples before them in the same run, of which none is held
+    out.
 
     Raises:
         ConfigError: there are no such samples.

@@ -30,7 +30,7 @@ class NanGuard:
         """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
         the next step."""
         self.sound = self.outputs_finite
-        """The same tensor, under the name that it has in saved states."""
+        """The tensor `outputs_finite`, under its name in saved states."""
         self._terms = observations
         self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
         self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action

@@ -59,9 +59,9 @@ OF_TERRAIN: dict[str, str] = {
         "num_cols",
     )
 }
-"""More such settings, for ground that is not a plane."""
+"""Settings of terrain that is not a plane -> setting here of the same meaning."""
 OF_HEIGHTS = {f"terrain.{name}": f"terrain.{name}" for name in ("measured_points_x", "measured_points_y")}
-"""More such settings, if heights are measured."""
+"""Settings of measured heights -> setting here of the same meaning."""
 
 OF_LEARNING: dict[str, str] = {
     "seed": "env.seed",
@@ -97,7 +97,7 @@ OF_RECURRENT = {
     "policy.rnn_hidden_size": "train.policy.rnn_hidden_dim",
     "policy.rnn_num_layers": "train.policy.rnn_num_layers",
 }
-"""More such settings, if `runner.policy_class_name` is recurrent."""
+"""Settings of recurrent policies (`runner.policy_class_name`) -> setting here of the same meaning."""
 
 TERRAINS: tuple[dict[str, float], ...] = (
     {"slope_up": 0.5, "slope_down": 0.5},

@@ -107,7 +107,7 @@ def command_on(record: Record, command: str) -> str:
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return the facts about a run, a line each."""
+    """Return the facts about a run, one on each line."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
