@@ -29,7 +29,7 @@ class StepRecord:
         self.shapes = [tuple(value.shape[1:]) for value in values]
         self.widths = [int(np.prod(shape)) for shape in self.shapes]
         self.row = torch.zeros(task.num_envs, sum(self.widths), device=task.device)
-        """(N, W) last step of every robot, from before resets."""
+        """(N, W) quantities of the last step of every robot, stored before any reset."""
 
     def take(self) -> None:
         """Write the row."""

@@ -75,7 +75,7 @@ class Layout:
     observation_clip: float = field(default=LARGEST, metadata=positive(LARGEST))
     """Scaled observations are clipped at plus and minus this."""
     velocity_point: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=between(-100, 100))
-    """Point of the base whose velocity `base_lin_vel` is, as that of an IMU, base frame [m]."""
+    """Point of the base, such as the place of its IMU, whose velocity the term `base_lin_vel` gives; base frame [m]."""
     phase_offsets: tuple[float, ...] = field(default=(0.0,), metadata=items(16, between(-100, 100)))
     """Phase of each clock at the start [rad]."""
     phase_period_s: float = field(default=1.0, metadata=positive(1000))

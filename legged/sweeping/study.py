@@ -277,7 +277,7 @@ def _machine() -> str:
 
 
 def _began(pid: int) -> str:
-    """Return the start of a process of this machine, in the system's unit; 'gone' if there is no such process."""
+    """Return the start time of a process on this machine, in the system's unit; 'gone' if there is no such process."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return "gone" if fields[0] in "ZX" else fields[19]
