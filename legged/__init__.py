@@ -4,14 +4,14 @@ The names of this package are imported at their first use, because a robot's com
 MuJoCo.
 """
 
-from legged.process.startup import importing, only_lists  # first: it records the time
+from legged.process.startup import importing, only_lists  # first, because it records the start time
 
 import importlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING or not only_lists():
-    from legged.process.headless import HEADLESS  # before MuJoCo: it sets MUJOCO_GL
+    from legged.process.headless import HEADLESS  # before MuJoCo, because it sets MUJOCO_GL
     from legged.errors import ConfigError
     from legged.gymnasium_ids import announce
 

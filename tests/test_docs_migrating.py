@@ -69,7 +69,7 @@ def test_rewards_are_the_same_lines_before_and_after():
 
 
 def test_names_of_legged_gym_are_all_of_them():
-    text = PAGE[PAGE.index("### What needs no change") : PAGE.index("### What to change")]
+    text = PAGE[PAGE.index("### Code that needs no change") : PAGE.index("### Code to change")]
     assert column(text, 1) == {*PLAIN, *COMPUTED, *CONSTANT, *KEPT}
 
 

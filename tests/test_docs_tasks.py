@@ -137,7 +137,7 @@ def test_excerpts_are_what_the_files_say(file, text):
 
 
 def test_the_table_of_randomisation_names_every_field():
-    part = RANDOMISATION.partition("## How and when")[0]
+    part = RANDOMISATION.partition("## Distribution and time")[0]
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", part, flags=re.MULTILINE))
     units = {name: "" if field.unit == "1" else f" [{field.unit}]" for name, field in FIELDS.items()}
     assert rows == {name: f"{field.meaning}{units[name]}" for name, field in FIELDS.items()}

@@ -60,13 +60,13 @@ def build_parser() -> CommandParser:
     parser.add_argument("--out", type=Path, default=Path("actuator"), help="folder that is written")
     parser.add_argument("--joints", default="", help="parts of the names of the joints to fit; all by default")
     parser.add_argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default")
-    parser.add_argument("--hidden", help="units of its layers; 32,32,32, of an lstm 8,8")
+    parser.add_argument("--hidden", help="units of the network's layers; 32,32,32 by default, 8,8 for an lstm")
     parser.add_argument("--samples", type=int, default=3, help="moments that an mlp sees; 3 by default")
-    parser.add_argument("--spacing", type=float, default=0.01, help="time between them [s]; 0.01 by default")
+    parser.add_argument("--spacing", type=float, default=0.01, help="time between the moments of an mlp [s]; 0.01 by default")
     parser.add_argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default")
-    parser.add_argument("--updates", type=int, help="updates of the network; 2000, of an lstm 3000")
+    parser.add_argument("--updates", type=int, help="updates of the network; 2000 by default, 3000 for an lstm")
     parser.add_argument("--longest-delay", type=float, default=0.05, help="delays up to this are tried [s]; 0.05 by default")
-    parser.add_argument("--seed", type=int, default=1, help="of the network's first weights")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the network's first weights")
     return parser
 
 

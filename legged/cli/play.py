@@ -57,7 +57,7 @@ def build_parser() -> CommandParser:
     )
     add_legged_gym_arguments(parser, "policy")
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
-    parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default")
     parser.add_argument("--headless", action="store_true", help="record even where there is a display")
     parser.add_argument("--gif", action="store_true", help="also write a GIF")
     parser.add_argument("--no-video", action="store_true", help="export and measure only")

@@ -28,11 +28,13 @@ ROOM_MB = 100.0
 
 def _add_arguments(parser: CommandParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME")
-    parser.add_argument("--name", help="of the robot; that of the file by default")
+    parser.add_argument("--name", help="name of the robot; that of the file by default")
     parser.add_argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default")
     parser.add_argument("--extends", metavar="TASK", help="task to take rewards from; base/quadruped_flat or base/biped_flat")
     parser.add_argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated")
-    parser.add_argument("--packages", type=Path, action="append", default=[], help="where to look for package:// as well")
+    parser.add_argument(
+        "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
+    )
     parser.add_argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default")
     parser.add_argument("--damping", type=float, help="D gain of all joints [N m s/rad]")
     parser.add_argument("--force", action="store_true", help="write over a robot of that name")

@@ -21,7 +21,7 @@ from legged.terrain import Terrain, check_terrain, terrain_types
 def _add_arguments(parser: CommandParser) -> None:
     add_task_arguments(parser)
     parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
-    parser.add_argument("--difficulty", type=float, default=0.5, help="of the tiles in the picture, 0 to 1")
+    parser.add_argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
 
 

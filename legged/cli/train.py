@@ -69,7 +69,7 @@ def _add_arguments(parser: CommandParser) -> None:
     parser.add_argument("--note", help="a sentence about this run, for its report and the table of all runs")
     parser.add_argument("--rl-device", help="device of the networks; that of the simulation by default")
     parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
-    parser.add_argument("--headless", action="store_true", help="accepted for legged_gym's sake: training draws nothing")
+    parser.add_argument("--headless", action="store_true", help="without effect; legged_gym has this option")
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )

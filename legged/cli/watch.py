@@ -43,7 +43,7 @@ def build_parser() -> CommandParser:
     add_checkpoint_argument(parser)
     add_build_arguments(parser)
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
-    parser.add_argument("--difficulty", type=float, help="of the tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default")
     parser.add_argument("--host", default=HOST, help="address that is listened at; this machine alone by default")
     parser.add_argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default")
     return parser

@@ -6,7 +6,7 @@ from typing import Literal
 from legged.config.bounds import LARGEST, TERMS, between, positive, quantity
 
 MOTORS = "motors.npz"
-"""Name of the copy of `network` in a run folder and in an export."""
+"""File name of the copy of a learned actuator (`network`) in a run folder and in an export."""
 LONGEST_DELAY = 1000
 """Largest delay, in steps."""
 Steps = tuple[int, int]

@@ -34,8 +34,7 @@ class PolicyConfig:
     actor_observations: tuple[str, ...] = field(default=("actor",), metadata=NAMES)
     """Observation groups that the policy reads, concatenated in this order."""
     critic_observations: tuple[str, ...] = field(default=("critic",), metadata=NAMES)
-    """Observation groups that the value function reads, concatenated in this order; those of the policy if both are to see
-    the same."""
+    """Observation groups that the value function reads, concatenated in this order. They may be the policy's groups."""
     actor_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
     """Widths of the policy's hidden layers."""
     critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
@@ -153,8 +152,8 @@ class RunnerConfig:
     """Iterations between two evaluations during training; 0 for none. They measure the policy without exploration, on
     separate robots without disturbances."""
     evaluate_share: float = field(default=0.03, metadata=UNIT)
-    """Largest share of the time in iterations that evaluations during training may take. One that would exceed it is skipped,
-    except the first and the last; 1 skips none."""
+    """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed it is
+    skipped, except the first and the last; 1 skips none."""
     evaluate_envs: int = field(default=256, metadata=between(1, 2**20))
     """Largest number of robots of an evaluation during training. The commands of the task's grid are distributed over
     them."""

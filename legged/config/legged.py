@@ -50,8 +50,8 @@ class TerrainConfig:
     mesh_type: Literal["plane", "height_map"] = "plane"
     """Shape of the ground: an infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
     curriculum: bool = True
-    """Move robots to harder rows while they succeed. Otherwise every row has a random high difficulty, and robots stay in
-    theirs."""
+    """Move robots to harder rows while they succeed. Without it, every row has a random high difficulty, and robots stay in
+    their row."""
     scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "rescaled": "m"})
     """Factor on all lengths of the terrain types; 1 suits a robot half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
@@ -248,8 +248,8 @@ class LeggedRewardsConfig(RewardsConfig):
     tracking_sigma: float = field(default=0.25, metadata=positive(LARGEST, low=1e-6))
     """Width of the tracking rewards exp(-error^2 / sigma)."""
     air_time_target_s: float = field(default=0.5, metadata=rescaled("s", between(0, 100)))
-    """Swing time above which feet_air_time rewards a step, below which it punishes, and at which single_stance pays most
-    [s]."""
+    """Target of the swing time [s]. feet_air_time rewards longer swings and punishes shorter ones; single_stance is largest
+    at it."""
     feet_clearance_target: float = field(default=0.1, metadata=rescaled("m", between(0, 100)))
     """Height of a swinging foot above the lowest foot that feet_clearance rewards [m]."""
     base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))
@@ -327,8 +327,8 @@ class EvaluationConfig:
     yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("rad/s", AXIS))
     """Yaw rates of the command grid: lowest, highest, step [rad/s]."""
     stairs: float = field(default=0.36, metadata=positive(10))
-    """Size of the steps, as a share of rewards.base_height_target, whose success rate a table of several tasks shows. The
-    table takes the next larger measured size."""
+    """Height of the stairs in a table of several tasks, as a share of rewards.base_height_target. The table shows the success
+    rate at the next larger measured height."""
 
 
 @dataclass(frozen=True)

@@ -65,13 +65,13 @@ class _Layer:
     name: str
     """Name in errors."""
     folder: Path
-    """Folder to which its paths are relative."""
+    """Folder to which the paths in the settings are relative."""
     task: str | None
     """Name of the registered task; None for a file."""
     kind: Any
-    """Class of the task that it names, or None."""
+    """Value of `class:`, or None."""
     reference_robot: Any
-    """Robot for which its numbers are written, or None for any robot."""
+    """Robot for which the numbers are written, or None for any robot."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
@@ -136,7 +136,7 @@ class ClassHint:
     """Class of the task according to one configuration of a chain."""
 
     where: str
-    """Beginning of errors about it."""
+    """Beginning of errors about this hint."""
     task: str | None
     """Name of the registered task, which may have a class; None for a file."""
     kind: Any
@@ -151,8 +151,8 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Merge layers, so that the nearest file has the last word. On a CPU, the `cpu:` section of each layer is merged on top
-    of it.
+    """Merge layers. A value of the nearest file replaces those of files that it extends. On a CPU, the `cpu:` section of each
+    layer is merged on top of it.
 
     Each layer is checked separately, so that a later one can't hide a mistake. Numbers of a layer with a reference robot are
     rescaled for `robot`, or if None, for the robot that the layers name.
@@ -181,7 +181,7 @@ def _merged(
             if not isinstance(layer.reference_robot, str):
                 raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.reference_robot)}")
             rescaled: Mapping[str, Any] = data
-            if rescale is not None and isinstance(robot, str):  # other values are refused with the command line
+            if rescale is not None and isinstance(robot, str):  # a wrong type of `robot` is refused later
                 reference = robot_path(layer.reference_robot, layer.folder)
                 rescaled = rescale(data, reference, robot, where)
                 origins.reference_robots = tuple(dict.fromkeys([*origins.reference_robots, reference]))

@@ -77,7 +77,8 @@ class ObservationsConfig:
     """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
-    """Group -> its content. The group `actor` is the policy's by default; `train.policy` sets the groups of each network."""
+    """Group -> terms, history and noise of the group. The group `actor` is the policy's by default; `train.policy` sets the
+    groups of each network."""
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
     """Term -> factor; 1 for other terms."""
     add_noise: bool = True
@@ -92,7 +93,7 @@ class ObservationsConfig:
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
     """Term -> range of each robot's delay, drawn for an episode, in control steps."""
     dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
-    """Term -> share of the control steps in which its packet is lost. The values of the step before then stay."""
+    """Term -> share of the control steps in which its packet is lost. The values of the previous step are then kept."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Absolute value at which scaled observations are clipped."""
 

@@ -75,7 +75,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
     if not policy.estimator.targets:
         if policy.estimator.latent:
             where = origins.where("train.policy.estimator.latent")
-            raise ConfigError(f"{where}: must be 0 without an estimator; {path}=[base_lin_vel] makes one")
+            raise ConfigError(f"{where}: must be 0 without an estimator; {path}=[base_lin_vel] adds one")
         return
     if ESTIMATED in cfg.observations.groups:
         where = origins.where(f"observations.groups.{ESTIMATED}")
@@ -98,7 +98,8 @@ def _check_student(cfg: TaskConfig) -> None:
     """Check a student against the settings of distillation.
 
     Raises:
-        ConfigError: it has a learned standard deviation or an estimator, or gradients would leave steps over.
+        ConfigError: it has a learned standard deviation or an estimator, or its gradient_length does not divide the steps of
+        an iteration.
     """
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:

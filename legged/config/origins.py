@@ -15,7 +15,9 @@ class Origins(dict[str, str]):
         """Sources whose numbers were rescaled from a reference robot (rescale.py)."""
 
     def note(self, path: str, source: str) -> None:
-        """Record that `source` set `path`, and remove the entries that this replaces, above and below."""
+        """Record that `source` set `path`, and remove the entries that it replaces: those of its parents and of its
+        children.
+        """
         for old in [key for key in self if key.startswith(f"{path}.") or path.startswith(f"{key}.")]:
             del self[old]
         self[path] = source

@@ -48,11 +48,11 @@ class KickConfig:
     z: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """Range of the change along z, world frame [m/s]."""
     roll: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
-    """Range of the change of the base's angular velocity about its x axis, base frame [rad/s]."""
+    """Range of the change of the base's angular velocity about the base's x axis, base frame [rad/s]."""
     pitch: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
-    """Range of the change about its y axis, base frame [rad/s]."""
+    """Range of the change about the base's y axis, base frame [rad/s]."""
     yaw: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
-    """Range of the change about its z axis, base frame [rad/s]."""
+    """Range of the change about the base's z axis, base frame [rad/s]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
     """Iterations between which kicks grow from zero to their full ranges; [0, 0] for the full ranges at once."""
 

@@ -29,13 +29,13 @@ class FieldText:
     unit: str
     """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty without one, or if each entry has its own."""
     bounds: str
-    """Bounds of its numbers; empty without any."""
+    """Bounds of the field's numbers; empty without any."""
     meaning: str
-    """Its docstring, on one line."""
+    """Docstring of the field, on one line."""
     choices: tuple[str, ...] = ()
-    """All values that it can have, if they are few."""
+    """All values that the field can have, if they are few."""
     is_section: bool = False
-    """True if it is a section, whose fields follow it."""
+    """True if the field is a section. The section's own fields follow."""
 
 
 def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[FieldText]:

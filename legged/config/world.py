@@ -45,12 +45,13 @@ class SimConfig:
     ls_iterations: int = field(default=20, metadata=between(1, 10_000))
     """Largest number of line-search iterations per solver iteration."""
     step: Literal["auto", "fused", "library"] = "auto"
-    """Implementation of a physics step in mujoco_warp. `library`: dozens of launches of its own. `fused`: one launch each for
-    the part before contacts, for contacts, for their forces and for integration; a model that does not fit is an error.
-    `auto`: `fused` where the model fits; else fused contact forces where those fit (60 degrees of freedom)."""
+    """Implementation of a physics step in mujoco_warp. `library`: mujoco-warp's own code, which has dozens of launches.
+    `fused`: one launch each for the part before contacts, for contacts, for their forces and for integration; a model that
+    does not fit is an error. `auto`: `fused` where the model fits; else fused contact forces where those fit (60 degrees of
+    freedom)."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
-    """Contacts allocated per robot in mujoco_warp and newton. Where their own launches find contacts, all robots share them,
-    and pairs of shapes close to each other use some too."""
+    """Contacts allocated per robot in mujoco_warp and newton. The libraries' own collision launches share them among all
+    robots, and also use some for shapes that are only close to each other."""
     njmax: int = field(default=96, metadata=between(1, 10_000))
     """Constraint rows allocated per robot in mujoco_warp and in Newton's MuJoCo solver: 4 per contact in the pyramidal cone,
     1 per joint limit."""

@@ -12,8 +12,8 @@ from legged.config.checks import shown
 from legged.errors import ConfigError
 
 MOST_BYTES = 250_000
-"""Size of the largest file that is read [bytes]. A complete configuration has 6000, and PyYAML needs seconds for this
-limit."""
+"""Size of the largest file that is read [bytes]. A complete configuration has 6000 bytes. PyYAML already needs seconds to
+read a file of this size."""
 DEEPEST = 40
 """Deepest nesting of maps and lists."""
 MOST_VALUES = 100_000

@@ -1,1 +1,3 @@
-"""The program that runs an exported policy on a robot. It needs numpy and onnxruntime, and of this package errors only."""
+"""The program that runs an exported policy on a robot. It needs numpy and onnxruntime. Of this package it imports the module
+`errors` only.
+"""

@@ -75,7 +75,7 @@ class Policy:
     """A policy on one robot: readings and commands -> joint targets, once every `contract.control_dt`."""
 
     def __init__(self, folder: Path) -> None:
-        """Load the export in `folder`, or of the policy.onnx that `folder` names.
+        """Load the export in `folder`, which may also be the path of its policy.onnx.
 
         Raises:
             ConfigError: there is no export, or this program cannot run it.

@@ -132,8 +132,8 @@ class Program:
         return Event.QUIT in events
 
     def _read(self) -> None:
-        """Process and log the new readings. A reading with the time of the last one is the same measurement sent again, and
-        keeps its age. A stop request in any of them counts.
+        """Process and log the new readings. A reading with the same time as the previous one repeats that measurement, whose
+        age goes on growing. A stop request in any reading counts.
         """
         stops = False
         for reading in self._robot.read():

@@ -39,7 +39,7 @@ SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
 MOMENT = struct.Struct("@ll")
 """Seconds and microseconds."""
 SET_S = 0.01
-"""Change of the difference between this machine's two clocks that shows that its time of day was set [s]."""
+"""Smallest change of the difference between this machine's two clocks that counts as a reset of its time of day [s]."""
 SOURCE_AGE_S = 0.2
 """Age at which the value of a source expires, by this machine's clock, since a robot may have none [s]."""
 
@@ -258,7 +258,7 @@ class UdpRobot(Interface):
             fresh = {name: values for name, (at, values) in self._seen.items() if came - at <= SOURCE_AGE_S}
             found.append(replace(state, sources=fresh))
         if found and not self._asked <= found[-1].sources.keys():
-            self._send(self._greeting)  # the first one may be lost
+            self._send(self._greeting)  # the first greeting may be lost
         return found
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:

@@ -305,7 +305,7 @@ class UnitreeRobot(Interface):
             raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
         self._wire.take_over()
         with self._lock:
-            del self._heard[:-1]  # states from before
+            del self._heard[:-1]  # only the newest state counts
 
     def _hear(self, state: Any) -> None:
         """Store the reading of a LowState_."""

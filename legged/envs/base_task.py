@@ -103,7 +103,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.actions = torch.zeros(n, self.num_actions, device=device)
         """(N, D) clipped actions of this step."""
         self.last_actions = torch.zeros_like(self.actions)
-        """(N, D) clipped actions of the step before."""
+        """(N, D) clipped actions of the previous step."""
         self.rew_buf = torch.zeros(n, device=device)
         """(N,) reward of this step."""
         self.terminated_buf = torch.zeros(n, dtype=torch.bool, device=device)
@@ -114,7 +114,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """(N,) True if the episode ended, by failure or time-out."""
         self.valid = torch.ones_like(self.terminated_buf)
         """(N,) True for environments whose numbers are finite and in bounds: state and actions of this step, rewards and
-        observations of the step before. The others are terminated and reset.
+        observations of the previous step. The others are terminated and reset.
         """
         self.reset_qpos = torch.zeros_like(self.physics.qpos)
         """(N, nq) generalised positions at the beginning of each environment's next episode."""

@@ -19,7 +19,7 @@ FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
 default.
 """
 RETURNING = ("return", "falls", "episode_length")
-"""The same for other tasks."""
+"""Figures of evaluations during training, for tasks without commands. The first one chooses the best policy by default."""
 MOST_IN_A_POOL = 2**31 - 1
 """Largest number of contacts, or of constraint rows, of all robots. Engines count them in 32 bits."""
 MOST_SAMPLES = 2**28
@@ -132,7 +132,7 @@ def check_sizes(cfg: TaskConfig) -> None:
     if robots * steps > MOST_SAMPLES:
         raise ConfigError(
             f"{cfg.origins.where('train.runner.num_steps_per_env')}: {steps} steps of {robots} robots (env.num_envs:"
-            f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples an iteration, more than {MOST_SAMPLES:,}"
+            f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples per iteration, more than {MOST_SAMPLES:,}"
         )
     policy = cfg.train.policy
     for field, widths in (

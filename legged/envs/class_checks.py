@@ -94,7 +94,7 @@ EXTENDED = {
     "remember": "otherwise last_actions and last_dof_vel would keep their initial values",
     "reset_idx": "otherwise no episode would begin",
 }
-"""Hook that must call super()'s -> effect of a missing call."""
+"""Hook whose override must call super()'s method -> effect of a missing call."""
 
 
 def check_overrides(cls: type) -> None:

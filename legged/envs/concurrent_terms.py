@@ -30,8 +30,8 @@ class ConcurrentTerms:
 
     def add(self, prefix: str, functions: Mapping[str, Function]) -> dict[str, Function]:
         """Add the functions with the mark `@concurrent` to the streams. Return replacements of all `functions`, in the same
-        order. A replacement returns the value computed by `start` at its first call after it, and computes a new one at other
-        calls.
+        order. At its first call after `start`, a replacement returns the value that `start` computed. At other calls it
+        computes a new value.
         """
         if not self._branches:
             return dict(functions)

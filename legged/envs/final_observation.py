@@ -46,7 +46,7 @@ class FinalStep:
 
 
 def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
-    """Attach a `FinalStep` to a task and return it. Everything else is as for `watch_steps`."""
+    """Attach a `FinalStep` to a task and return it, by `watch_steps`, which describes the arguments and errors."""
     return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
 
 

@@ -72,7 +72,9 @@ class JudgingTask:
         self.metrics = Metrics(metrics, *parts, full, self.num_envs, self.device)
 
     def _settled(self) -> dict[str, Tensor]:
-        """Return by name the tensors that are written after `_start_terms`. Before, they hold values of the last step."""
+        """Return by name the tensors that are written after `_start_terms`. Before that, they hold values of the last
+        step.
+        """
         named = {name: getattr(self, name) for name in SETTLED}
         found = zip(self.terminations.names, self.terminations.found, strict=True)
         return named | {f"terminations.found of '{name}'": tensor for name, tensor in found}

@@ -52,7 +52,7 @@ class ObservingTask:
         noisy = group.noise and cfg.add_noise
         noise = self._noise() if noisy else {}
         measured = terms.errors if noisy else None
-        if measured is not None:  # these terms get their noise there
+        if measured is not None:  # terms with errors get their noise in `ObservationErrors`
             noise = {term: half for term, half in noise.items() if term not in measured.names}
         scales = self.observation_scales()
         return ObservationGroup(measured or terms, group.terms, scales, noise, cfg.clip, group.history, self.numbers)

@@ -164,7 +164,7 @@ def check_observed(cfg: TaskConfig) -> None:
             draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
             if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
                 low, high = draw.range
-                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # its image would lie beyond -1 or 1
+                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # a mirrored value would lie beyond -1 or 1
                     raise ConfigError(
                         f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not the same on both sides of"
                         " 0, so it has no mirror image; train.algorithm.symmetry=false learns without"

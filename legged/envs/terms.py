@@ -59,7 +59,7 @@ class Terms:
     projected_gravity: Tensor
     """(N, 3) unit vector along gravity in the base frame."""
     dof_pos: Tensor
-    """(N, D) joint angles [rad]. `dof_vel` are joint velocities, `last_dof_vel` those of the step before [rad/s]."""
+    """(N, D) joint angles [rad]. `dof_vel` are joint velocities, `last_dof_vel` those of the previous step [rad/s]."""
     dof_vel: Tensor
     last_dof_vel: Tensor
     default_dof_pos: Tensor
@@ -76,8 +76,8 @@ class Terms:
     torques: Tensor
     """(N, D) joint torques of the last physics step [N m]."""
     actions: Tensor
-    """(N, A) clipped actions of this step, one for each joint that is not held. `last_actions` are those of the step
-    before.
+    """(N, A) clipped actions of this step, one for each joint that is not held. `last_actions` are those of the previous
+    step.
     """
     last_actions: Tensor
     commands: Tensor
@@ -148,7 +148,7 @@ class Terms:
 
     @unit("rad")
     def _obs_passive_pos(self) -> Tensor:
-        """Angles of the passive joints, less those of the default pose: among them how far springs give way [rad]."""
+        """Angles of the passive joints, less those of the default pose [rad]. For springs this is their deflection."""
         return self.physics.qpos[:, self.passive_qpos_columns] - self.passive_default_pos
 
     @unit("rad/s")
@@ -265,7 +265,7 @@ class Terms:
     @concurrent
     @unit("rad/s")
     def _reward_dof_vel_limits(self) -> Tensor:
-        """Joint speeds beyond their soft limits, at most 1 rad/s a joint [rad/s]."""
+        """Joint speeds beyond their soft limits, at most 1 rad/s for each joint [rad/s]."""
         limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
         return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
 

@@ -22,7 +22,8 @@ COLUMNS = {
 LOW_FIRST = ("length", "return")
 """Figures whose smallest value is the worst."""
 FELL = "fell"
-"""The order of what failed, the shortest first; then the rest, the worst in tracking or return first."""
+"""Order with failed episodes first, the shortest of them at the top, then the others by tracking error or return, the worst
+first."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class Figures:
     failed: np.ndarray
     """(E,)"""
     ended: list[list[str]]
-    """Which terms ended each episode."""
+    """Terms that ended each episode."""
     ends: list[str]
     """Names of everything that can end an episode."""
 

@@ -182,7 +182,7 @@ class StepRecord:
         self.shapes = [tuple(value.shape[1:]) for value in values]
         self.widths = [int(np.prod(shape)) for shape in self.shapes]
         self.row = torch.zeros(task.num_envs, sum(self.widths), device=task.device)
-        """(N, W) last step of every robot, from before resets."""
+        """(N, W) quantities of the last step of every robot, stored before any reset."""
 
     def take(self) -> None:
         """Write the row."""
@@ -217,10 +217,9 @@ def record_episodes(
     """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, the first of every
     robot before the second ones, and how often a robot lost contacts in a step for want of memory.
 
-    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off, and short episodes are not more
-    frequent than they should be, as they are among the episodes that end first. All robots hold `command`, vx, vy [m/s] and
-    yaw rate [rad/s], if it is given. `place` is called before the first reset to place robots. With `graph` the step is
-    captured on a GPU.
+    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off. Among the episodes that end first,
+    short ones would be too frequent. All robots hold `command`, vx, vy [m/s] and yaw rate [rad/s], if it is given. `place` is
+    called before the first reset to place robots. With `graph` the step is captured on a GPU.
 
     Raises:
         TermError: the step cannot be captured.

@@ -25,7 +25,7 @@ from legged.registry import make_task, task_class
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""
 SETTLE_S = 1.0
-"""Time at its start in which errors are not measured; at most a third of a shorter hold [s]."""
+"""Time at the start of a command in which errors are not measured; at most a third of a shorter hold [s]."""
 
 
 def few_commands(cfg: LeggedConfig) -> Grid:
@@ -120,9 +120,9 @@ class TrainingEvaluation:
 
         `return` is the mean undiscounted sum of scale * term over steps, `falls` the share of robots that failed,
         `episode_length` the mean number of steps until then. Of robots that follow commands, `lin_vel_rmse` [m/s] and
-        `ang_vel_rmse` [rad/s] are the root mean square errors of each command, averaged over commands, as `evaluate` has
-        them, but a fallen robot counts as standing still. The task's other metrics are means
-        over robots and steps.
+        `ang_vel_rmse` [rad/s] are the root mean square errors of each command, averaged over commands, as in `legged
+        evaluate`, except that a fallen robot counts as standing still. The task's other metrics are means over robots and
+        steps.
         """
         task, grid = self.task, self._grid
         device = torch.device(task.device)

@@ -16,7 +16,7 @@ from legged.robots.robot import Robot
 SETTLING_S = 2.0
 """Time of a single command after which velocities are measured [s]."""
 FALLEN = 1.0
-"""Lean of the base that counts as a fall [rad]."""
+"""Tilt of the base that counts as a fall [rad]."""
 SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
 """Solver settings: pyramidal cones, iterated to convergence."""
 
@@ -92,9 +92,9 @@ def play(
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
-    """Return the errors on the grid's commands, one robot each: root mean squares over the control steps after
-    `grid.settle_s`, up to a fall, of the horizontal velocity's error [m/s] and the yaw rate's [rad/s], mean and worst cell;
-    the share of falls; and in "cells" the same by command.
+    """Return the errors on the commands of the grid, one robot for each. Errors of the horizontal velocity [m/s] and of the
+    yaw rate [rad/s] are root mean squares over the control steps after `grid.settle_s`, up to a fall. The result has their
+    mean and worst cell, the share of falls, and in "cells" the same for each command.
     """
     stage, cells, rows = Stage(robot, policy, friction), grid.cells, []
     for command in cells:
@@ -142,7 +142,7 @@ def _standing(model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy) -> np.
     data.qpos[:] = robot.default_qpos
     data.qpos[list(robot.qpos_columns)] = policy.default
     low, high = 0.0, 10.0 * robot.file.spawn_height
-    for _ in range(40):  # the height from which on nothing touches
+    for _ in range(40):  # from this height on, nothing touches the ground
         data.qpos[2] = 0.5 * (low + high)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)

@@ -107,7 +107,7 @@ def device_name(device: torch.device) -> str:
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
-    """Write a result as a JSON file, and its folder where it is not there.
+    """Write a result as a JSON file, and make its folder if it is missing.
 
     Raises:
         RunError: the file can't be written.

@@ -200,7 +200,7 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
-    lost contacts in a control step for want of memory.
+    lost contacts in a control step because memory was full.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()

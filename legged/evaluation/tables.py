@@ -16,7 +16,9 @@ def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], le
 def screen_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
 ) -> Table:
-    """Return a table for the screen; columns in `left` hold texts, the others numbers. None among the rows is a rule."""
+    """Return a table for the screen; columns in `left` hold texts, the others numbers. None in place of a row draws a
+    rule.
+    """
     table = Table(title=escape(title), title_justify="left")
     for i, head in enumerate(heads):
         table.add_column(escape(head), justify="left" if i in left else "right")

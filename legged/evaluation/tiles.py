@@ -18,7 +18,7 @@ ROUGH_SPAWN = 2.0
 ROUGH_ROOM = 1.5
 """Margin of rough ground beyond the farthest point of a command [m]."""
 VARIANTS = 16
-"""Different tiles of each size of random types. Robots are shared out among them, because one tile may have an easy way out.
+"""Different tiles of each size of random types. Robots are distributed over them, because one tile may have an easy way out.
 """
 
 

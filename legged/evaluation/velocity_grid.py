@@ -32,9 +32,9 @@ class Grid:
     robots: int = 16
     """Robots a cell."""
     hold_s: float = 4.0
-    """Time a command is held [s]."""
+    """Time for which a command is held [s]."""
     settle_s: float = 1.0
-    """Time at its start that is not measured [s]."""
+    """Time at the start of a command that is not measured [s]."""
 
     @property
     def cells(self) -> np.ndarray:

@@ -71,9 +71,9 @@ def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, An
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
-    power of the cost of transport is that of the last physics step of each control step, which is below the mean over all.
-    `contact_overflows` counts robots times steps that lost contacts for want of memory; `estimates` holds the errors of a
-    policy with an estimator.
+    power of the cost of transport is that of the last physics step of each control step, which is lower than the mean over
+    all physics steps. `contact_overflows` counts robots times steps that lost contacts because memory was full; `estimates`
+    holds the errors of a policy with an estimator.
     """
     commands = torch.tensor(grid.cells, dtype=torch.float32, device=torch.device(task.device))
     sums = {name: torch.zeros_like(value) for name, value in _now(task).items()}

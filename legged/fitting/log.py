@@ -131,7 +131,7 @@ def read_log(path: Path) -> ActuatorLog:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or 'no .npz file'}") from error
-    except Exception as error:  # zipfile, numpy and zlib raise their own
+    except Exception as error:  # zipfile, numpy and zlib raise their own classes
         raise ConfigError(f"{path}: no .npz file of plain arrays") from error
     for name in arrays:
         if name not in NEEDED + OPTIONAL:

@@ -1,4 +1,4 @@
-"""Constants of a control step: its Python numbers as tensors that are on the device before a CUDA graph is captured."""
+"""Constants of a control step: Python numbers as tensors that are on the device before a CUDA graph is captured."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,7 +33,7 @@ class Constants:
         """Return the constant of a key; make it if it is missing.
 
         Raises:
-            HostReadError: the constant is missing, and the step before did not need it.
+            HostReadError: the constant is missing, and the previous step did not need it.
         """
         if key not in self._made:
             if self.complete:
@@ -73,7 +73,7 @@ class Constants:
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
             raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
         if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
-            return index  # torch takes most of these for tuples and warns
+            return index  # torch interprets most sequences as tuples and warns
         pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 

@@ -53,8 +53,8 @@ class ForbidHostReads:
     the host.
 
     If the same step runs several times, the guard also compares the runs, from the third on. The attributes of `owner` other
-    than tensors must not change. The numbers passed to torch must be the same. The step must not read a tensor that the step
-    before allocated, because a graph goes on reading the memory of its capture. A tensor may be allocated, kept as an
+    than tensors must not change. The numbers passed to torch must be the same. The step must not read a tensor that the
+    previous step allocated, because a graph goes on reading the memory of its capture. A tensor may be allocated, kept as an
     attribute, and read outside the step or later in the same step. The first runs may set up anything that they keep.
 
     This package's own physics engines are exempt. Those on the host work on numpy arrays and are never captured.
@@ -78,7 +78,7 @@ class ForbidHostReads:
 
     @property
     def compares(self) -> bool:
-        """True if this step is compared with the one before."""
+        """True if this step is compared with the previous one."""
         return self._steps >= self.STEPS
 
     def __enter__(self) -> "ForbidHostReads":
@@ -101,7 +101,7 @@ class ForbidHostReads:
         if kind is None:
             self._judge_state(self._state)
             if self.compares and len(self._record) != len(self._record_before):
-                raise HostReadError("the step makes fewer calls than the one before; a CUDA graph repeats the same ones")
+                raise HostReadError("the step makes fewer calls than the previous one; a CUDA graph repeats the same ones")
 
     @contextmanager
     def recording(self) -> Iterator[None]:
@@ -151,7 +151,7 @@ class ForbidHostReads:
     # ---- what the modes see ----------------------------------------------------------------------------------------------
 
     def run(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Run one operator and compare it with that of the step before."""
+        """Run one operator and compare it with that of the previous step."""
         inputs = [value for value in tree_leaves((args, kwargs)) if value is not None]
         over = overwritten(func, args, kwargs)
         read = [value for value in inputs if all(value is not other for other in over)]
@@ -173,7 +173,7 @@ class ForbidHostReads:
         return result
 
     def _judge(self, seen: "Seen", kept: dict[int, Tensor]) -> None:
-        """Compare an operator with the one in the same place of the step before."""
+        """Compare an operator with the one in the same place of the previous step."""
         place = len(self._record)
         before = self._record_before[place] if place < len(self._record_before) else Seen("nothing", {})
         if seen.call != before.call:

@@ -106,7 +106,7 @@ class StepGraph:
     def _capture(self, device: torch.device) -> "torch.cuda.CUDAGraph":
         import warp as wp
 
-        wp.init()  # a step without kernels of Warp has not called this yet
+        wp.init()  # a step without Warp kernels has not initialised Warp yet
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
         # Warp looks up a device at its first use, and a stream when it first sees it. During a capture these calls would
@@ -120,7 +120,7 @@ class StepGraph:
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
-        # With several processes, each has a thread for its collectives, which may call CUDA during the capture.
+        # Each of several processes has a thread for collective operations, which may call CUDA during the capture.
         error_mode = "thread_local" if torch.distributed.is_initialized() else "global"
         failure: Exception | None = None
         try:

@@ -35,7 +35,7 @@ LOGGED = "log/"
 
 
 class CapturedRunner(Runner):
-    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once an iteration.
+    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once per iteration.
 
     On a GPU it launches the next iteration before it logs the last one, so the device never waits for the log. Checkpoints,
     configuration and logs are those of Runner. Where a feature needs rsl-rl's own loop (`why_stock`), `learn` is Runner's.
@@ -94,7 +94,7 @@ class CapturedRunner(Runner):
             unlogged = launched
             saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
             evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
-            # The last but one is logged at once, so that a request to stop takes effect before the training is complete.
+            # The second-last iteration is logged at once, so that a request to stop takes effect before the last one.
             if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
                 self._log(launched)
                 unlogged = None
@@ -110,8 +110,8 @@ class CapturedRunner(Runner):
 
     @property
     def _runs_ahead(self) -> bool:
-        """True if the next iteration is launched before the last one is logged. Several processes log in step, because all of
-        them must agree to stop.
+        """True if the next iteration is launched before the last one is logged. Several processes do not run ahead, because
+        all of them must agree to stop.
         """
         return torch.device(self.device).type == "cuda" and not self.is_distributed
 
@@ -255,4 +255,4 @@ class LaunchedIteration:
     """Iterations of the whole training, including those of the run that this one resumes."""
     readback: AsyncReadback
     clock: Clock
-    """Laps of its rollout and its update."""
+    """Clock with the times of the rollout and of the update."""

@@ -155,7 +155,7 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
     """Return an optimiser's state from a checkpoint, with checked moments. Every setting but the learning rate is that of
-    `optimizer`. The first `waiting` parameters may lack moments, if none of these has any.
+    `optimizer`. The first `waiting` parameters may lack moments, but only all of them together.
 
     Raises:
         ConfigError: the state does not fit these parameters; the text begins with `where`.
@@ -228,7 +228,9 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Return the same settings for a checkpoint that lacks them, as far as the weights in `state` show them."""
+    """Return the settings that `networks` gives, for a checkpoint that lacks them, as far as the weights in `state` show
+    them.
+    """
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")
@@ -318,7 +320,7 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
-    """Check that the optimiser of a checkpoint is the configured one. Checkpoints that do not name theirs used Adam.
+    """Check that the optimiser of a checkpoint is the configured one. A checkpoint that names no optimiser used Adam.
 
     Raises:
         ConfigError: it is another one.

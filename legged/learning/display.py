@@ -24,7 +24,7 @@ class Style:
     row: str
     """Label in the table."""
     word: str
-    """Label on the line; empty if the metric continues the one before it."""
+    """Label on the line; empty if the metric continues the previous metric."""
     spec: str
     unit: str
     factor: float = 1.0

@@ -20,7 +20,7 @@ from legged.learning.recurrent import Memory
 class DeviceDistillation(Distillation):
     """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for recurrent and other students.
 
-    The differences from rsl-rl are these. Losses are summed on the device and read once an iteration. A student without
+    The differences from rsl-rl are these. Losses are summed on the device and read once per iteration. A student without
     recurrent layers learns from all steps of a gradient in one batch. The optimiser is fused. A recurrent teacher keeps its
     hidden state from one iteration to the next, while rsl-rl resets it. With `stock`, rsl-rl's own update and loop run.
     """
@@ -101,7 +101,7 @@ class DeviceDistillation(Distillation):
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
         """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`; without
-        them, those of the last update are read from the device. The loss is NaN if no gradient was used.
+        `numbers`, the results of the last update are read from the device. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken

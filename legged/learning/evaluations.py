@@ -25,7 +25,7 @@ class Measurement(Protocol):
 
     @property
     def figures(self) -> Sequence[str]:
-        """Names of the figures that it measures, the most important one first."""
+        """Names of the measured figures, the most important one first."""
 
     def measure(self, policy: nn.Module) -> dict[str, float]:
         """Measure a policy and return figure -> value."""
@@ -45,7 +45,9 @@ class Evaluated:
 
 
 class Ended(Exception):
-    """Error raised when an evaluation ends the training, at the end of an iteration, when networks and optimiser agree."""
+    """Error that ends the training after an evaluation. It is raised between iterations, when networks and optimiser are
+    consistent.
+    """
 
 
 class Evaluations:

@@ -25,7 +25,7 @@ from legged.process.neighbours import Neighbours
 
 
 class Interrupted(Exception):
-    """Error raised when a training was asked to stop, at the end of an iteration, when networks and optimiser agree."""
+    """Error that stops a training on request. It is raised between iterations, when networks and optimiser are consistent."""
 
 
 class QuietLogger(Logger):
@@ -117,7 +117,7 @@ class QuietLogger(Logger):
                 super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         finally:
             self.device = device
-        self.ep_extras.clear()  # rsl-rl clears them only where it writes, in the first process
+        self.ep_extras.clear()  # rsl-rl clears the episode infos only in the first process, which writes them
         self.divergence.update(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time

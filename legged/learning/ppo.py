@@ -31,7 +31,7 @@ class DevicePPO(CriticWarmup):
     """PPO (Schulman et al., arXiv 1707.06347) as rsl-rl computes it, for Gaussian MLP policies.
 
     The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
-    memory once an update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
+    memory once per update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
     divergence are written out. The optimiser is fused. Losses are summed on the device and read once. An actor's estimator
     learns from the same mini-batches. Where a feature needs rsl-rl's own update (`why_stock`), that one runs.
     """
@@ -199,7 +199,7 @@ class DevicePPO(CriticWarmup):
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
         """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`;
-        without them, those of the last update are read from the device.
+        without `numbers`, the results of the last update are read from the device.
 
         Losses are NaN if all mini-batches were skipped. The root mean square errors of the estimates follow as
         `Estimator/<term>_rmse`, each in the term's unit.
@@ -331,7 +331,7 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # with several processes, a view of the shared buffer
+        for parameter, gradient in of_actor:  # the gradient: with several processes, a view of the shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 

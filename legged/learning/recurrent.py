@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 GATES = {4: "lstm", 3: "gru"}
-"""Number of gates, which is the rows of a recurrent layer's weights over its width -> type of the layer."""
+"""Number of gates (rows of a recurrent layer's weights, divided by its width) -> type of the layer."""
 
 
 def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:

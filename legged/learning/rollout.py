@@ -85,7 +85,7 @@ class Steps(ABC):
 
     def _sum_squared_differences(self) -> None:
         """Sum the squared differences between the returns of ended episodes and their mean. This takes a second pass, because
-        a sum of squares would lose them in float32 where the mean is large.
+        in float32 a sum of squares would be too inaccurate where the mean is large.
         """
         moved = self._return_at - self.ended[1] / self.ended[0]
         self.ended[3].copy_(torch.where(self.storage.dones.squeeze(-1).bool(), moved.square(), self._zero).sum())

@@ -197,7 +197,8 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
 
 
 def own_run(name: str, where: str) -> Path:
-    """Return the folder of one of this user's runs, named as for `run_named`. The run need not have a checkpoint.
+    """Return the folder of one of this user's runs. `run_named` describes the possible names. The run need not have a
+    checkpoint.
 
     Raises:
         ConfigError: there is no such run, or the name is that of a shipped policy.

@@ -190,7 +190,7 @@ class Runner(OnPolicyRunner):
             good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
             raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
-            if self.is_distributed and "by peer" in str(error):  # gloo reports it; with NCCL, torchrun does
+            if self.is_distributed and "by peer" in str(error):  # gloo's report; for NCCL, torchrun reports
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
             raise
         leave()
@@ -291,7 +291,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            waiting = len([*self.alg.get_policy().parameters()])  # these may lack moments
+            waiting = len([*self.alg.get_policy().parameters()])  # the policy's parameters may lack moments
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
@@ -304,7 +304,7 @@ class Runner(OnPolicyRunner):
         """Set the learning rate: that of the checkpoint if it adapts, that of the configuration if it is fixed."""
         settings = self.env.cfg.train.algorithm
         self.alg.learning_rate = settings.learning_rate if settings.schedule == "fixed" else saved
-        first = self.alg.optimizer.param_groups[0]  # the estimator's group comes after it and keeps its own rate
+        first = self.alg.optimizer.param_groups[0]  # the estimator's group, which comes next, keeps its own rate
         if not isinstance(first["lr"], Tensor):
             first["lr"] = self.alg.learning_rate
 
@@ -367,7 +367,9 @@ class Runner(OnPolicyRunner):
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
-        """Return the return and length so far of each environment's episode, (N,) each, as counted for the log."""
+        """Return the sum of rewards and the length so far of each environment's episode, (N,) each, as counted for the
+        log.
+        """
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 
     def _memory(self) -> dict[str, Tensor]:

@@ -31,11 +31,12 @@ class Timing:
     loop_s: float
     """Time in iterations. It includes logging, except in rsl-rl's own loop [s]."""
     wall_s: float
-    """Time since the start of the process. It adds to the two above the capture of graphs, checkpoints and evaluations [s].
+    """Time since the start of the process [s]. It includes the two times above, the capture of graphs, checkpoints and
+    evaluations.
     """
     device: str
     kernels_compiled: int
-    """Modules of Warp kernels that its cache lacked."""
+    """Number of Warp modules that were compiled, because Warp's cache lacked them."""
     beside: int = 0
     """Largest number of other trainings seen at one time on the same device; with several GPUs, on that of the first process.
     """

@@ -69,7 +69,7 @@ def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
 
     Raises:
         ConfigError: as in `check_tracker`.
-        RunError: the tracker does not start, for want of a login or a connection.
+        RunError: the tracker does not start, because a login or a connection is missing.
     """
     runner = cfg.train.runner
     if runner.logger == TENSORBOARD:

@@ -90,9 +90,9 @@ class Friction:
 class Actuator:
     """Actuators of N robots with D joints: delay, motor and friction between targets and joint torques.
 
-    A target is set once a control step. It reaches the law after the robot's delay, in physics steps; before the first target
-    arrives, joints have the target of action 0. The torque of the law is limited to that of the motor, then friction is
-    subtracted.
+    A target is set once per control step. It reaches the law after the robot's delay, in physics steps; before the first
+    target arrives, joints have the target of action 0. The torque of the law is limited to that of the motor, then friction
+    is subtracted.
     """
 
     STATE: tuple[str, ...] = ("targets", "delay")
@@ -260,7 +260,7 @@ def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], st
 
 def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
     """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,) each. The speed of ideal motors is infinite.
-    `where` is as for `modelled_joints`.
+    `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint, or a motor has neither a no-load speed nor a velocity limit.
@@ -276,7 +276,7 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
 
 def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
     """Return the robot with the rotor inertias of the configuration (control.actuator.armature); without them, the same
-    robot. `where` is as for `modelled_joints`.
+    robot. `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -289,8 +289,8 @@ def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] =
 def friction_numbers(
     robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Coulomb and breakaway friction [N m] and viscous friction [N m s/rad] of all joints, (D,) each. `where` is as
-    for `modelled_joints`.
+    """Return Coulomb and breakaway friction [N m] and viscous friction [N m s/rad] of all joints, (D,) each. `where` turns a
+    dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint, or breakaway friction is below Coulomb friction.
@@ -322,8 +322,8 @@ def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np
 
 
 def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where: Callable[[str], str] = str) -> None:
-    """Check that the actuators fit the robot, its control law and the physics step `sim_dt` [s]. `where` is as for
-    `modelled_joints`.
+    """Check that the actuators fit the robot, its control law and the physics step `sim_dt` [s]. `where` turns a dotted path
+    into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or the
@@ -340,8 +340,8 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that ideal motors are given no torque-speed line by mistake. A setting `ideal` is allowed over the numbers of a
-    file, so that the same motors can be tried without their line.
+    """Check that ideal motors are given no torque-speed line by mistake. The command line may set the model to `ideal` where
+    a file gives the numbers of a line, so that motors can be tried without it.
 
     Raises:
         ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and
@@ -363,7 +363,7 @@ def check_slowest(
     robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
 ) -> None:
     """Check that torque-speed lines fit the physics step if no-load speeds are randomised, at the `lowest` factor on them.
-    `where` is as for `modelled_joints`.
+    `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: at that factor a motor is too strong for the physics step, as for `check_actuator`.

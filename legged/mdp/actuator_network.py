@@ -26,7 +26,8 @@ FORMAT = 1
 WIDEST, DEEPEST = 1024, 16
 """Largest number of units in a layer, and of layers."""
 TOLERANCE = 1e-3
-"""Largest deviation between samples of a network and physics steps, as a share of a physics step."""
+"""Largest difference between the time of a network's sample and a whole number of physics steps, as a share of a physics
+step."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class NetworkWeights:
 
         Raises:
             KeyError: an array is missing.
-            ValueError: a layer does not fit the one before, or has non-finite weights.
+            ValueError: a layer does not fit the previous one, or has non-finite weights.
         """
         if not (self.dt > 0.0 and self.samples > 0 and self.scales.shape == (3,) and 0 < len(self.layers) <= DEEPEST):
             raise ValueError("its header makes no sense")
@@ -113,7 +114,7 @@ class NetworkWeights:
             out = len(layer["bias"]) // 4 if cell else len(layer["bias"])
             shapes = {"input": (4 * out, width), "hidden": (4 * out, out)} if cell else {"weight": (out, width)}
             if not 0 < out <= WIDEST or any(layer[name].shape != shape for name, shape in shapes.items()):
-                raise ValueError(f"layer {i} does not fit the one before")
+                raise ValueError(f"layer {i} does not fit the previous one")
             if not all(np.isfinite(array).all() for array in layer.values()):
                 raise ValueError(f"layer {i} has weights that are NaN or infinite")
             width = out
@@ -137,7 +138,7 @@ class NetworkWeights:
 
 
 class ActuatorNetwork:
-    """Learned actuator, evaluated once a physics step for all D joints of all N robots."""
+    """Learned actuator, evaluated once per physics step for all D joints of all N robots."""
 
     def __init__(
         self,

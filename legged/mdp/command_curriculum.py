@@ -79,7 +79,7 @@ class CommandCurriculum:
         return dict(zip(names, (self._full_limit * self.share).unbind(), strict=True))
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the progress of the curriculum, for any number of robots."""
+        """Return the progress of the curriculum. It does not depend on the number of robots."""
         return {"share": self.share.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:

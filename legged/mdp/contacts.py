@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""
 SHARE_OF_WEIGHT = 0.01
-"""The same threshold for lighter robots, as a share of their weight: a foot of a robot of 400 g would never feel 1 N."""
+"""Threshold of a contact for lighter robots, as a share of their weight, because a foot of a robot of 400 g never feels 1
+N."""
 GRAVITY = 9.81
 """Acceleration of gravity, for weights [m/s^2]."""
 
@@ -24,8 +25,8 @@ def contact_force(mass: float) -> float:
 
 
 class FeetContacts:
-    """Contacts of F feet of N robots. A foot is in contact if it touches the ground now or did so a step before, so that a
-    single missed sample does not split a stance.
+    """Contacts of F feet of N robots. A foot is in contact if it touches the ground now or did so in the previous step, so
+    that a single missed sample does not split a stance.
     """
 
     STATE = ("_flags", "_times")

@@ -45,7 +45,7 @@ class Control:
         from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
-            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held without P.
+            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held by another law than P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:
@@ -185,8 +185,8 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
 
 
 def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the indices of the joints that have an action, (A,): all joints that are not held. `where` is as for
-    `control_gains`.
+    """Return the indices of the joints that have an action, (A,): all joints that are not held. `where` turns a dotted path
+    into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint, all joints are held, or joints are held by another law than P.
@@ -202,7 +202,7 @@ def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], 
 
 
 def action_scales(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> np.ndarray:
-    """Return the scale of each action, (A,). `where` is as for `control_gains`.
+    """Return the scale of each action, (A,). `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: as for `acted_joints`; or a pattern matches no joint with an action, or a joint with an action has no

@@ -125,7 +125,7 @@ def _ends(draw: DrawConfig) -> tuple[float, float]:
     low, high = draw.range
     if draw.distribution == "log_uniform":
         return math.log(low), math.log(high)
-    if draw.distribution == "gaussian":  # torch.erfinv makes normal numbers of them; at +-1 they would be infinite
+    if draw.distribution == "gaussian":  # torch.erfinv turns them into normal numbers, which would be infinite at +-1
         reach = 0.5 * (high - low) / standard_deviation(draw) if high > low else 0.0
         end = min(math.erf(reach / math.sqrt(2.0)), 1.0 - 1e-6)
         return -end, end

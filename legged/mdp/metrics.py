@@ -1,4 +1,4 @@
-"""Means that are logged of a rollout, accumulated on the device without synchronisation."""
+"""Means for the log of a rollout, accumulated on the device without synchronisation."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -29,7 +29,7 @@ class Metrics:
         self._functions = dict(functions)
         self.reward_names, self.termination_names = tuple(reward_names), tuple(termination_names)
         self.reward_unit, self.num_envs = reward_unit, num_envs
-        # Sums by robot. `flush` adds up the robots, so that a step costs two launches a table instead of three.
+        # Sums by robot. `flush` adds up the robots, so that a step costs two launches for each table instead of three.
         self._metrics = torch.zeros(len(self._functions), num_envs, device=device)
         # Rows: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
         self._counts = torch.zeros(3 + len(self.termination_names), num_envs, device=device)

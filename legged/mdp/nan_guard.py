@@ -30,13 +30,13 @@ class NanGuard:
         """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
         the next step."""
         self.sound = self.outputs_finite
-        """The same tensor, under the name that it has in saved states."""
+        """The tensor `outputs_finite`, under its name in saved states."""
         self._terms = observations
         self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
         self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
         self._seen = torch.zeros_like(self._now)
         self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
-        # The largest size of each observation column, which costs two launches a step. `flush` counts the robots.
+        # Largest size of each observation column. It costs two launches per step. `flush` counts the robots.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:

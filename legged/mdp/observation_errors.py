@@ -1,6 +1,6 @@
 """Errors of observations: a constant bias within an episode, noise, delay, and loss.
 
-Errors are applied to terms once a control step, so that all groups with noise see the same errors.
+Errors are applied to terms once per control step, so that all groups with noise see the same errors.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Observation groups: named terms, each evaluated once a step, then scaled, given noise, clipped and concatenated."""
+"""Observation groups: named terms, each evaluated once per step, then scaled, given noise, clipped and concatenated."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from legged.mdp.random_pool import RandomPool
 
 
 class ObservationTerms:
-    """Observation terms of all groups of a task, each evaluated once a step, then concatenated."""
+    """Observation terms of all groups of a task, each evaluated once per step, then concatenated."""
 
     def __init__(self, functions: Mapping[str, Callable[[], Tensor]]) -> None:
         """Call the function of each term once, to learn its width. Each returns (N, width).
@@ -41,13 +41,13 @@ class ObservationTerms:
         self.raw = self.values
         """(N, width) terms as their functions returned them, NaN and infinite numbers included."""
         self.errors: ObservationErrors | None = None
-        """Errors of some terms, for groups with noise; None if there are no errors but noise."""
+        """Bias, delay and loss of terms, for groups with noise; None without them."""
 
     def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
         """Evaluate all terms into `raw` and `values`, then update `errors` by a control step.
 
         Robots of `begun` (N,) have new episodes. With `again`, `errors` repeat the measurement of the same step. Without
-        `begun`, `errors` only show the measurement that the step would give, and their state stays.
+        `begun`, `errors` only show the measurement that the step would give, and keep their state.
 
         Raises:
             TermError: a term fails.

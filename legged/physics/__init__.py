@@ -36,7 +36,8 @@ __all__ = [
 
 
 MANY_WORLDS = 256
-"""Number of worlds from which `auto` chooses mujoco_warp without a GPU too: for so many, compiling its kernels pays."""
+"""Number of worlds from which `auto` chooses mujoco_warp without a GPU too: with so many, its speed makes up for compiling
+its kernels."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:

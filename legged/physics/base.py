@@ -45,8 +45,8 @@ class Physics(ABC):
     robot_state: RobotState | None = None
     """State of a robot with a floating base and feet; None for any other model."""
     why_library: str = ""
-    """Reason for which parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused
-    step makes all of it, or if the engine has no fused step."""
+    """Reason why parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused step
+    does everything, or if the engine has no fused step."""
     why_c_engine: str = ""
     """Reason for which `auto` chose the C engine instead of the fused step for this many worlds; empty otherwise."""
     fitted: str = ""

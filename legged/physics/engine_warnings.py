@@ -17,7 +17,7 @@ def warning_printer() -> Callable[[str], None]:
         kind = re.sub(r"\d+", "#", text)
         if kind not in printed:
             printed.add(kind)
-            sys.stderr.write(f"warning: MuJoCo: {text}\n")  # in one write, because the engine warns from several threads
+            sys.stderr.write(f"warning: MuJoCo: {text}\n")  # one call of write, because the engine warns from several threads
 
     return print_warning
 

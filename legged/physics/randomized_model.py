@@ -117,7 +117,7 @@ def check_ranges(
         ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for
             example because it leaves no mass.
     """
-    model = scene.model(sim, "none") if ranges else None  # no field changes the ground, and building it takes long
+    model = scene.model(sim, "none") if ranges else None  # without the ground, which no field changes
     for name in ranges:
         if name not in FIELDS:
             path = where("domain_rand.ranges")

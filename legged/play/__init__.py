@@ -1,1 +1,1 @@
-"""A policy on show: its ground, its outing, films, the window, and the page in a browser (live/)."""
+"""Demonstration of a policy: its ground, its walk, films, the window, and the page in a browser (live/)."""

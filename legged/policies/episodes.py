@@ -42,7 +42,7 @@ def measure_episodes(task: BaseTask, act: Policy, after_step: Callable[[int, flo
     numbers: `return`, `terms` (return by reward term), `length` [steps], `failures` (share), `metrics` (means over all
     environments and steps) and `contact_overflows`.
 
-    The return is the undiscounted sum of scale * term over steps: `rewards.times_dt` has no say in it. `after_step` is told
+    The return is the undiscounted sum of scale * term over steps: `rewards.times_dt` does not change it. `after_step` is told
     the number of the step, from 0, and the first environment's return so far.
     """
     observations = task.reset()
@@ -85,7 +85,7 @@ def spread_of(values: list[float]) -> dict[str, float]:
 
 
 def episodes_table(episodes: dict[str, Any], title: str) -> Table:
-    """Return a line a measure: return, its terms, lengths, failures, metrics."""
+    """Return one line for each measure: return, its terms, lengths, failures, metrics."""
     table = Table(title=escape(f"{title}: {episodes['count']} episodes"), title_justify="left")
     table.add_column("measure")
     for name in ("mean", "standard deviation", "least", "greatest"):

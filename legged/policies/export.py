@@ -180,7 +180,7 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
     inputs, outputs = module.input_names, module.output_names
     hidden = {name: {1: "batch"} for name in (*inputs[1:], *outputs[1:])}
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # of checks of shapes, which are fixed
+        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # checks of shapes
         warnings.filterwarnings("ignore", message="Exporting a model to ONNX with a batch_size other than 1")
         torch.onnx.export(
             module,

@@ -58,15 +58,16 @@ class Layout:
     action_clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Largest action."""
     joints: tuple[str, ...] = ()
-    """The policy's joints in its order; empty takes those that the ONNX file names, or else the robot's."""
+    """Joints in the policy's order; empty takes the joints that the ONNX file names, or else the robot's."""
     action_joints: tuple[str, ...] = ()
-    """Those of them that have an action, in its order; the others stay at their default angles. Empty takes all."""
+    """Joints that have an action, in the order of the actions; the others stay at their default angles. Empty takes all
+    joints."""
     default_joint_angles: dict[str, float] = field(default_factory=dict, metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]; empty takes the robot's."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; empty takes the ONNX file's, or else the robot's."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; likewise."""
+    """Joint-name pattern -> D gain [N m s/rad]; empty as for `stiffness`."""
     torque_limits: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest torque [N m]; empty takes the robot's."""
     implicit_gains: bool = False
@@ -74,7 +75,7 @@ class Layout:
     observation_clip: float = field(default=LARGEST, metadata=positive(LARGEST))
     """Scaled observations are clipped at plus and minus this."""
     velocity_point: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=between(-100, 100))
-    """Point of the base whose velocity `base_lin_vel` is, as that of an IMU, base frame [m]."""
+    """Point of the base, such as the place of its IMU, whose velocity the term `base_lin_vel` gives; base frame [m]."""
     phase_offsets: tuple[float, ...] = field(default=(0.0,), metadata=items(16, between(-100, 100)))
     """Phase of each clock at the start [rad]."""
     phase_period_s: float = field(default=1.0, metadata=positive(1000))

@@ -28,9 +28,11 @@ class Neighbours:
     """
 
     def __init__(self, device: str) -> None:
-        """`device` is its unique name on the machine, such as a GPU's UUID, whatever numbers processes give to devices."""
+        """Take the unique name of the `device` on this machine, such as a GPU's UUID. It does not depend on the numbers that
+        processes give to devices.
+        """
         self.most = 0
-        """Largest number of others seen at one time."""
+        """Largest number of other trainings seen at one time."""
         self._folder = Path(tempfile.gettempdir()) / FOLDER / device
         self._path: Path | None = None
         self._lock: IO[bytes] | None = None
@@ -52,14 +54,14 @@ class Neighbours:
         for folder in (self._folder.parent, self._folder):
             with contextlib.suppress(FileExistsError):
                 folder.mkdir()
-                folder.chmod(0o1777)  # for every user, as the folder around it
+                folder.chmod(0o1777)  # writable for every user, like its parent folder
         if not (self._folder / TURN).exists():
             (self._folder / TURN).touch(0o644)
         descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
         self._lock = os.fdopen(descriptor, "wb")
         os.chmod(name, 0o644)
         lock_descriptor(descriptor, blocking=False)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees it
+        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
 
     def glance(self) -> None:
         """Count the others, unless the last count was a moment ago."""

@@ -39,7 +39,7 @@ class RobotFile:
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; an empty table leaves the gains to a rule by inertia and weight (gains.py)."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; an empty table, as for `stiffness`."""
+    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the same rule."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest joint speed [rad/s]; an empty table means 30 for all joints."""
     penalize_contacts_on: tuple[str, ...] = ()

@@ -27,7 +27,7 @@ from legged.terrain import Terrain
 OFFERS = frozenset({"base_lin_vel", "heights"})
 """Additional sources, known to a simulator, which a robot would have to estimate."""
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
-"""MuJoCo's warnings after which it has reset the state."""
+"""Warnings of MuJoCo that accompany a reset of the state."""
 FALLEN = 1.2
 """Lean of the base above which the robot has fallen [rad]."""
 OURS = "control.actuator"

@@ -65,7 +65,7 @@ class SweepConfig:
     trials: int = field(default=20, metadata=between(1, 1_000_000))
     """Trials in all, of all processes."""
     seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
-    """Seeds of each trial; its value is their mean."""
+    """Seeds of each trial. The value of a trial is the mean over its seeds."""
     objective: ObjectiveConfig = ObjectiveConfig()
     """The objective."""
     pruner: Literal["median", "hyperband", "none"] = "median"

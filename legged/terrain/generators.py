@@ -174,7 +174,7 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
 
     Sides are drawn from BLOCK_SIDES. Tops are at 0 to `height` in quarters of it, and a later block hides the ground below
     it. The sum of the blocks' areas is `cover` times the tile's. So a robot meets a face of up to `height` every few steps,
-    and level ground as long as the robot is rare.
+    and hardly ever a level stretch of its own length.
     """
     rows, columns = tile.heights.shape
     left = cover * rows * columns
@@ -212,8 +212,8 @@ def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0)
     """Cover the tile except its middle with slabs of stone.
 
     Sides are drawn from STONE_SIDES, edges lie at any angle, and tops are at quarters of `height` up to it. Where stones
-    overlap, the higher one counts. The sum of the stones' areas is `cover` times the tile's. So faces come at any angle,
-    ragged by the cells, and few tops are large enough for a whole foot.
+    overlap, the higher one counts. The sum of the stones' areas is `cover` times the tile's. So faces lie at any angle, with
+    ragged edges (cells are square), and few tops are large enough for a whole foot.
     """
     rows, columns = tile.heights.shape
     step = tile.cell / tile.scale
@@ -253,8 +253,8 @@ class TerrainType:
     finest: tuple[float, str] | None = None
     """Length of the smallest part of a tile of scale 1 [m], and its name; cells must not be larger."""
     exact: bool = False
-    """True if that part must be a whole number of cells, since another cell would change the ground. It matters for
-    evaluations.
+    """True if that part must be a whole number of cells, since another size of cells would change the ground. Evaluations
+    check it.
     """
 
     def sized(self, difficulty: float, scale: float) -> float:

@@ -27,8 +27,8 @@ class HeightMap:
     def of(cls, heights: np.ndarray, cell: float, origin: tuple[float, float], steepest: np.ndarray) -> "HeightMap":
         """Return the height map of the cell heights `heights` (X, Y), with cells joined where no face is between them.
 
-        `steepest` (X, Y) is the largest slope (rise over run) that stays a slope. Between two cells with a larger difference,
-        by the smaller of their two values, there is a vertical face. legged_gym makes such faces from a triangle mesh by one
+        `steepest` (X, Y) is the largest slope (rise over run) that stays a slope. Two cells have a vertical face between them
+        if their slope exceeds the smaller of their two values. legged_gym makes such faces from a triangle mesh by one
         threshold for all types.
         """
         return cls(heights, join(heights, cell * steepest), cell, origin)

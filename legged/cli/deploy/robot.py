@@ -83,17 +83,20 @@ def main(argv: list[str] | None) -> int:
 def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the simulation."""
     parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
-    parser.add_argument("--size", type=float, help="of the tile's type, in its unit, e.g. the height of a step [m]")
+    parser.add_argument("--size", type=float, help="size of the tile, in the unit of its type, e.g. the height of a step [m]")
     parser.add_argument(
-        "--cell", type=float, default=0.1, help="edge of the tile's cells [m], of which treads have whole ones; default 0.1"
+        "--cell",
+        type=float,
+        default=0.1,
+        help="edge of the tile's cells [m]; treads are whole cells; default 0.1",
     )
     parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
-    parser.add_argument("--latency", type=float, default=0.0, help="of packets, in each direction [s]; default 0")
+    parser.add_argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0")
     parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
-    parser.add_argument("--seed", type=int, default=1, help="of the loss, and of the motors' delay; default 1")
-    parser.add_argument("--ideal-motors", action="store_true", help="whatever the policy was trained with")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1")
+    parser.add_argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with")
     parser.add_argument(
-        "overrides", nargs="*", metavar="key=value", help="of control.actuator, e.g. control.actuator.model=ideal"
+        "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
     )
 
 
@@ -101,7 +104,7 @@ def check_simulation(args: argparse.Namespace) -> None:
     """Check the numbers of the simulation's flags.
 
     Raises:
-        ConfigError: a number makes no sense.
+        ConfigError: a number is out of bounds.
     """
     largest = 0.0
     if args.terrain is not None:

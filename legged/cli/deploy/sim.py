@@ -132,7 +132,7 @@ def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     """
     if given is not None:
         return load_robot(given, "--robot")
-    for folder in exported.absolute().parents[:2]:  # the run of an exported single checkpoint, or of the export of all
+    for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels up
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
             if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
@@ -163,7 +163,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         start_new_session=True,  # Ctrl-C is for the program, which stops the robot safely first
     )
     program = None
-    if in_main_thread():  # a signal to this process is meant for all three
+    if in_main_thread():  # a signal to this process ends the other two as well
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None

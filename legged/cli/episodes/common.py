@@ -28,11 +28,11 @@ LIST = "episodes.md"
 def add_recording_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the recording."""
     add_build_arguments(parser)
-    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"how many; {EPISODES} by default")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"number of episodes; {EPISODES} by default")
     parser.add_argument("--as-trained", action="store_true", help="with noise, pushes, randomisation and curricula")
     parser.add_argument("--command", metavar="VX,VY,YAW", help="the command, held throughout [m/s, m/s, rad/s]")
     parser.add_argument("--terrain", metavar="TYPE", help="type of a few tiles, e.g. stairs_up, in place of the training's")
-    parser.add_argument("--difficulty", type=float, help="of such tiles, 0 to 1; 0.5 and 0.8 by default")
+    parser.add_argument("--difficulty", type=float, help="difficulty of such tiles, 0 to 1; 0.5 and 0.8 by default")
 
 
 def add_listing_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def add_listing_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ended", metavar="TERM", help="only episodes that this termination ended")
     parser.add_argument("--top", type=int, default=TOP, help=f"episodes to list; {TOP} by default")
     parser.add_argument("--page", metavar="IDS", help="episodes to make pages of, by number: 3 or 3,17")
-    parser.add_argument("--worst", type=int, default=0, help="also make pages of the first so many of the list")
+    parser.add_argument("--worst", type=int, default=0, help="number of episodes at the top of the list that get a page")
     parser.add_argument("--parquet", action="store_true", help="also write one flat table in Parquet; needs pyarrow")
 
 

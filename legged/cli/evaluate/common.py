@@ -38,7 +38,7 @@ def add_grid_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of a grid of velocity commands."""
     for axis, unit in AXES.items():
         parser.add_argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
-    parser.add_argument("--robots", type=int, default=ROBOTS, help=f"robots a cell; {ROBOTS} by default")
+    parser.add_argument("--robots", type=int, default=ROBOTS, help=f"robots for each cell; {ROBOTS} by default")
 
 
 def add_points_arguments(parser: argparse.ArgumentParser, full: str) -> None:

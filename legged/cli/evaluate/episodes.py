@@ -23,7 +23,7 @@ def build_parser() -> CommandParser:
         "legged evaluate episodes half_cheetah",
         "legged evaluate episodes humanoid --episodes 64 --physics mujoco",
     )
-    parser.add_argument("--episodes", type=int, default=ENVIRONMENTS, help=f"how many; {ENVIRONMENTS} by default")
+    parser.add_argument("--episodes", type=int, default=ENVIRONMENTS, help=f"number of episodes; {ENVIRONMENTS} by default")
     return parser
 
 

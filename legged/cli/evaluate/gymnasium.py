@@ -22,7 +22,7 @@ def build_parser() -> CommandParser:
         "legged evaluate gymnasium half_cheetah",
         "legged evaluate gymnasium half_cheetah --episodes 100",
     )
-    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"how many; {EPISODES} by default")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help=f"number of episodes; {EPISODES} by default")
     return parser
 
 

@@ -72,7 +72,7 @@ def build_parser() -> CommandParser:
         "--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"
     )
     for axis, unit in AXES.items():
-        parser.add_argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another is given")
+        parser.add_argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another one is given")
     parser.add_argument("--seconds", type=float, help=f"length of each command; {SECONDS:g}, of a grid's {HOLD_S:g}")
     parser.add_argument("--friction", type=float, default=0.8, help="between robot and ground; 0.8 by default")
     parser.add_argument("--rmse", type=float, help="largest mean velocity RMSE of a grid that is followed [m/s]")
@@ -91,7 +91,9 @@ def evaluate(argv: list[str] | None) -> int:
     settling = grid.settle_s if grid else SETTLING_S
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
     if not settling < seconds <= 1000.0:
-        raise ConfigError(f"--seconds: must be above {settling:g}, which it has to settle, and at most 1000, got {seconds}")
+        raise ConfigError(
+            f"--seconds: must be above {settling:g}, in which the robot settles, and at most 1000, got {seconds}"
+        )
     if not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [_command(text) for text in args.command or ()] or COMMANDS
@@ -172,7 +174,7 @@ def _follow_all(
     robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
     """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
-    time come in its order.
+    time are sorted by it.
     """
     known = [(path, policy, _marks(policy)) for path, policy in zip(files, policies, strict=True)]
     heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")

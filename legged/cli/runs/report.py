@@ -26,7 +26,7 @@ from legged.process.paths import exists, ready_to_write, relative, write_text
 SIDE = 320
 """Width and height of the film [pixels]."""
 LONGEST_FILM_S = 900.0
-"""Longest time for filming; a longer one hangs, and the process is ended [s]."""
+"""Time limit for filming, after which the process is ended because it hangs [s]."""
 LONGEST_NOTE = 1000
 
 

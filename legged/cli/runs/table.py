@@ -24,9 +24,7 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help=f"folders of runs; {LOGS}/ by default")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; {LOGS}/, or the first one given")
-    parser.add_argument(
-        "--seeds-share", action="store_true", help="a row of means for runs that differ in nothing but their seed"
-    )
+    parser.add_argument("--seeds-share", action="store_true", help="one row of means for runs that differ in their seed only")
     add_import_argument(parser)
     return parser
 

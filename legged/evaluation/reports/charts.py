@@ -1,7 +1,7 @@
 """Charts of reports: lines with bands, stacked areas and heat maps as SVG, and several charts in one PNG.
 
-Each SVG stands alone and is also part of a page as it is. Colours are those of M. Okabe and K. Ito (Color Universal Design,
-2008), which readers of any colour vision tell apart; lines differ in their dashes too.
+Each SVG can be a file of its own, or part of a page without a change. Colours are those of M. Okabe and K. Ito (Color
+Universal Design, 2008), which people with any colour vision can distinguish. Lines also differ in their dashes.
 """
 
 import math
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0
 """Margins around the axes [SVG units]."""
 MOST_POINTS = 240
-"""Points of a line; neighbours in a longer line are averaged. There are hardly more pixels."""
+"""Largest number of points of a line; a longer line is averaged to as many. A drawing has hardly more pixels."""
 LETTER = 6.3
 """Mean width of a letter of the legend [SVG units]."""
 INK, QUIET, GRID, REST = "#1b1f24", "#57606a", "#e1e5e9", "#9aa4ae"
@@ -36,7 +36,7 @@ class Line:
     """A curve: x and y (n,); `band` is the lower and the upper edge (n,) of an area around it."""
 
     name: str
-    """Name in the legend; a line without one is called by the chart's title."""
+    """Name in the legend; a line without a name gets the chart's title."""
     x: np.ndarray
     y: np.ndarray
     band: tuple[np.ndarray, np.ndarray] | None = None
@@ -131,7 +131,7 @@ def draw_panel(axis: Any, chart: Chart) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if not chart.log:
         low, high = _y_range(chart)
-        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # markers at 100 % are whole
+        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # markers at 100 % are not cut off
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -157,7 +157,7 @@ def curves(chart: Chart) -> str:
 
 
 def stacked(chart: Chart, x: np.ndarray, parts: dict[str, np.ndarray]) -> str:
-    """Draw parts (n,) over x (n,) on top of each other, those below 0 downwards from it, and their sum as a line."""
+    """Draw stacked areas (n,) over x (n,), positive parts above 0 and negative parts below 0, and their sum as a line."""
     x, *values = _thinned(x, *parts.values())
     ups, downs = (np.cumsum([np.zeros(len(x)), *(of(v, 0.0) for v in values)], axis=0) for of in (np.maximum, np.minimum))
     sums = replace(chart, lines=[Line("", x, edge) for edge in (ups[-1], downs[-1])])
@@ -222,7 +222,7 @@ class _Frame:
         self._keys: list[dict[str, Any]] = []
         self._places: list[dict[str, float]] = []
         left, row = LEFT, 0
-        for name in names:  # a new row of the legend where the last one has no room
+        for name in names:  # a new row of the legend if the last row has no room
             width = 28.0 + LETTER * len(name)
             left, row = (LEFT, row + 1) if left + width > WIDTH - 2.0 and left > LEFT else (left, row)
             self._places.append({"x": left, "y": TOP + 6.0 + 16.0 * row})

@@ -179,8 +179,8 @@ def text_of(cell: Cell) -> str:
 
 
 def _room(head: str, cells: Sequence[Cell]) -> str:
-    """Return non-breaking spaces that keep a column of texts readable: viewers of Markdown squeeze the texts of a table
-    that is wider than the page to a word a line, but not below the width of their head. Two spaces are as wide as a letter.
+    """Return non-breaking spaces that keep a column of texts readable: viewers of Markdown squeeze the texts of a table that
+    is wider than the page to one word per line, but not below the width of their head. Two spaces are as wide as a letter.
     """
     longest = max((len(text) for text in map(text_of, cells) if " " in text), default=0)
     return "&nbsp;" * (2 * (min(longest, SHORT) - len(head)))
@@ -195,7 +195,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text on one line in which no letter means anything to Markdown; tables escape their bars."""
+    """Return a text on one line that is escaped for Markdown; tables escape their bars too."""
     return _escaped(" ".join(text.split()))
 
 

@@ -32,7 +32,7 @@ FORMS = {
     "loop [s]": ".1f",
     "steps/s": ",.0f",
 }
-"""Formats of the figures that rows shared by seeds average."""
+"""Formats of the figures that are averaged in a row of several seeds."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
 """Share of robots above which stairs count as crossed."""
@@ -115,8 +115,8 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest steps that robots crossed up and down, with all lower ones [m]; 0 if they did not
-    cross the lowest; None without an evaluation both ways.
+    """Return the height of the highest steps that robots crossed up and down, as they did all lower steps [m]; 0 if they did
+    not cross the lowest; None without an evaluation both ways.
     """
     points = [types_in(result).get(name, {}).get("points", []) for name in STAIRS]
     ways = [{point["size"]: point["share"] for point in of_type} for of_type in points]

@@ -66,12 +66,12 @@ class Record:
 
     folder: Path
     config: dict[str, Any]
-    """The resolved configuration, with this version's names if it can be read by it."""
+    """The resolved configuration. Its names are those of this version, if this version can read it."""
     began: datetime
     timing: Timing | None
     scalars: Scalars
     results: tuple[dict[str, Any], ...]
-    """Evaluations, one an engine."""
+    """Evaluations, one for each engine."""
     code: Code
     note: str
     """Note of the user."""
@@ -80,7 +80,7 @@ class Record:
     why: str
     """Details of the status."""
     done: int
-    """Iterations of the last policy or log, with those before a resumption."""
+    """Iterations of the last policy or log, including those before a resumption."""
     problems: tuple[str, ...]
     """Reasons why parts could not be read."""
     given: Invocation | None = None
@@ -123,7 +123,9 @@ class Record:
         return Log(self.scalars, self.config)
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
-        """Return the checkpoint of an evaluation; an empty text if it is the last one, which the other figures describe."""
+        """Return the checkpoint of an evaluation; an empty text if it is the last checkpoint, which all other figures
+        describe.
+        """
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
 

@@ -43,7 +43,7 @@ from legged.process.paths import relative
 from legged.process.processes import child_environment
 
 REPORT = "report"
-"""Name of its files, before their ending."""
+"""Name of the report's files, before their ending."""
 ROWS = 10
 """Rows of the table over training."""
 LARGEST_FILM = 12 * 2**20
@@ -115,7 +115,7 @@ def command_on(record: Record, command: str) -> str:
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return the facts about a run, a line each."""
+    """Return the facts about a run, one on each line."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
@@ -266,8 +266,8 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
     itself is complete.
 
     `film_with` holds the options by which another process finds the run's task. That process films the policy and writes the
-    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output. It
-    is another process because a driver that fails while it draws may end it, or never return.
+    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output.
+    The film has its own process because a graphics driver that fails may end the process, or hang.
     """
     start = time.perf_counter()
     try:
@@ -288,7 +288,7 @@ def _film_apart(folder: Path, options: Sequence[str]) -> str:
         return "no film: nothing can be drawn"
     command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *options]
     alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
-    alone["CUDA_VISIBLE_DEVICES"] = ""  # it draws on the CPU, and a GPU's memory may be full
+    alone["CUDA_VISIBLE_DEVICES"] = ""  # the film is drawn on the CPU, because a GPU's memory may be full
     alone["LP_NUM_THREADS"] = "1"  # threads of Mesa, which draws without a GPU
     FILMING[:] = [process for process in FILMING if process.poll() is None]
     try:

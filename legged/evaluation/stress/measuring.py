@@ -152,7 +152,7 @@ class Bench:
         cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
         specs = [TileSpec(name, self.riser, self.tread) for name in STAIRS]
         outcomes, times = self._run_out(per_robot, specs, [cell, *changes])
-        # (up or down, line, robot) -> line by line
+        # From the order (up or down, line, robot) to rows of lines.
         outcomes, times = (values.view(2, len(rows), half).transpose(0, 1).flatten(1) for values in (outcomes, times))
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
 

@@ -103,8 +103,8 @@ def is_mixed(solref: np.ndarray) -> np.ndarray:
 
 
 def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:
-    """Return True if the contacts of each pair use the spring of one shape, even in worlds that differ in it: that of the
-    shape with priority, or that of two shapes with the same solref.
+    """Return True if each pair of shapes uses the spring of one of its shapes in all worlds, even if springs differ between
+    worlds. This holds if one shape has priority, or if both have the same solref.
     """
     for first, second, pair in pairs:
         solref, priority = model.geom_solref[[first, second]], model.geom_priority[[first, second]]

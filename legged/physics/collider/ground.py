@@ -35,7 +35,7 @@ class Ground:
     cell: float
     """Edge of a cell [m]."""
     reach: int
-    """Number of cells beyond its own that the largest feature can touch."""
+    """Number of cells, beyond the one below it, that the largest feature can touch."""
 
 
 @wp.struct

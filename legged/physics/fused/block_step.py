@@ -70,7 +70,7 @@ class BlockStep:
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
         solver = step.solver
-        moved = contacts.equalities  # rows of equality constraints depend on poses, so these were computed before
+        moved = contacts.equalities  # poses were computed before, because rows of equality constraints depend on them
         self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, *solver.settings, solver.arrays, step.state]
         blocks = -(-step.worlds // WIDE)
         threads = min(threads, blocks)

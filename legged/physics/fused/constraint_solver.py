@@ -133,7 +133,7 @@ class ConstraintSolver:
         rows = np.repeat(np.arange(m.nv), counts)
         self.constants = solver_constants(tree, d.njmax, len(rows), damped, friction, dry, elliptic, active_set is not None)
         self.wide: dict[str, Constant] | None = None
-        """Constants of wide_solver.h if it is the solver, which is on a CPU; None otherwise."""
+        """Constants of wide_solver.h, if that solver is used (on a CPU only); None otherwise."""
         if d.qacc.device.is_cpu and not elliptic and fits_wide(m.nv, d.njmax):
             entries = rows, columns[: len(rows)]
             self.wide = wide_constants(tree, entries, d.njmax, damped, friction, active_set is not None)

@@ -86,8 +86,8 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
     """Integrate one joint by semi-implicit Euler. The world's first joint also sets the overflow flags.
 
-    All reads precede all writes, for a free joint separately in its position and its orientation: the compiler moves no read
-    ahead of a write, so each read would wait for memory by itself.
+    All reads precede all writes, because the compiler moves no read ahead of a write, so each read would wait for memory by
+    itself. For a free joint this holds separately for its position and for its orientation.
     """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]

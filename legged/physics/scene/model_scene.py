@@ -28,7 +28,7 @@ class ModelScene(Scene):
         """
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", ".* is deprecated")  # the user of a file cannot change what it contains
+                warnings.filterwarnings("ignore", ".* is deprecated")  # the file may not be the user's own
                 spec = mujoco.MjSpec.from_file(str(self.path))
                 set_options(spec.option, sim)
                 model = spec.compile()

@@ -187,7 +187,7 @@ class _Lock:
         self._file.close()
 
     def acquire(self) -> bool:
-        """Return whether this process has it; do not wait for it."""
+        """Take the lock if it is free, without waiting. Return True if this process has it."""
         try:
             return lock_descriptor(self._file.fileno(), blocking=False)
         except OSError:  # a file system without locks; compiling twice does no harm

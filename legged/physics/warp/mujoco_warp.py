@@ -102,7 +102,7 @@ class MujocoWarpPhysics(WarpPhysics):
         if sim.step != "library":
             ask_for_dense_rows(self.model)
         for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
-            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo does this in each step; mujoco-warp does not
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo computes this in each step, mujoco-warp does not
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
@@ -237,7 +237,7 @@ class MujocoWarpPhysics(WarpPhysics):
             raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
         if no_solver:
             return
-        self._m.opt.run_qacc_smooth = False  # the fused solver does not start from it
+        self._m.opt.run_qacc_smooth = False  # the fused solver does not use the warm start
         if self.why_library:
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
@@ -263,7 +263,7 @@ class MujocoWarpPhysics(WarpPhysics):
         """Make a physics step of mujoco-warp's library."""
         with self._on_device():
             asked = self._m.opt.run_qacc_smooth
-            self._m.opt.run_qacc_smooth = True  # mujoco-warp's solver starts from it
+            self._m.opt.run_qacc_smooth = True  # mujoco-warp's solver starts from this acceleration
             mjw.step(self._m, self._d)
             self._m.opt.run_qacc_smooth = asked
 

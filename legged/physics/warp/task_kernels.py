@@ -309,24 +309,24 @@ class TaskKernels(Launcher):
 
     def name_module(self) -> None:
         """Launch one kernel of this module. A dry run calls it to find the modules that are needed; all kernels here are in
-        one.
+        one module.
         """
         wp.launch(hold_joints, dim=1)
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
-        """Launch the kernel of `Control.compute` for joints under PD control. The last argument is written."""
+        """Launch the kernel of `Control.compute` for joints under PD control. The last argument receives the result."""
         self.launch(hold_joints, dim, arguments)
 
     def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Actuator.drive` for joints under PD control. The last argument is written."""
+        """Launch the kernel of `Actuator.drive` for joints under PD control. The last argument receives the result."""
         self.launch(drive_joints, dim, arguments)
 
     def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` of an MLP. The last argument is written."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an MLP. The last argument receives the result."""
         self.launch(run_mlp, tuple(error.shape), (error, *arguments))
 
     def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` of an LSTM. The last argument is written."""
+        """Launch the kernel of `ActuatorNetwork.torques` of an LSTM. The last argument receives the result."""
         self.launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
@@ -342,11 +342,11 @@ class TaskKernels(Launcher):
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def make_draws(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Distributions.values`. The last argument is written."""
+        """Launch the kernel of `Distributions.values`. The last argument receives the result."""
         self.launch(make_draws, tuple(arguments[-1].shape), arguments)
 
     def make_fresh(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Randomization.draw`. The last two arguments are written."""
+        """Launch the kernel of `Randomization.draw`. The last two arguments receive the results."""
         self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
     def find_moments(self, *arguments: Tensor | float) -> None:
@@ -354,7 +354,7 @@ class TaskKernels(Launcher):
         self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def take_fresh(self, *arguments: Tensor) -> None:
-        """Launch the kernel of the second half of `Randomization.redraw`. The last argument is written."""
+        """Launch the kernel of the second half of `Randomization.redraw`. The last argument receives the result."""
         self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
 
     def vary_control(self, *arguments: Tensor) -> None:
@@ -367,7 +367,7 @@ class TaskKernels(Launcher):
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
     def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments are written."""
+        """Launch the kernel of `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments receive the results."""
         self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:

@@ -52,8 +52,8 @@ Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class Drawing:
-    """Robots and ground of a session in a viser scene. Everything is a child of the frame `/world`, which moves against the
-    followed robot. The robot so stays in the middle, and the user's view of it is kept.
+    """Robots and ground of a session in a viser scene. Everything is a child of the frame `/world`, which moves opposite to
+    the followed robot. So the robot stays in the middle, and the user's view of it is kept.
     """
 
     def __init__(self, server: Any, session: Session) -> None:

@@ -28,7 +28,7 @@ IDLE_S = 0.1
 SLOW = 0.9
 """The page warns when the pace is below this."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
-"""Letters that change the command: axis and direction. Viser's camera uses other letters and the arrows."""
+"""Letter keys that change the command -> axis and direction. Viser's camera uses other letters and the arrows."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
 """Directions of a push, from the robot's heading to the left [degrees]."""
 

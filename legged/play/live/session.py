@@ -190,8 +190,8 @@ class Session:
         self.look()
 
     def look(self) -> bool:
-        """Load the checkpoint to show if it has changed; return whether a policy was loaded. If loading fails, `problem` has
-        the reason and the present policy stays.
+        """Load the checkpoint to show if it has changed; return whether a policy was loaded. If loading fails, `problem`
+        holds the reason and the present policy stays in use.
         """
         path = self.watched.changed()
         if path is None:

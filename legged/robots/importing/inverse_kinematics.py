@@ -61,7 +61,7 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
     lows, highs = np.array([limb.ranges[k] for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
-    biped = len(legs) == 2  # three legs stand like four, each on its own side
+    biped = len(legs) == 2  # three legs stand like four legs, each on its own side
     stretch = UPRIGHT if biped else STRETCH
     ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # the height at which the shortest leg stands
 
@@ -173,7 +173,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
             mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
             both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
-            if (both[:, 0] <= both[:, 1]).all():  # else no pose suits both, and each leg is a limb of its own
+            if (both[:, 0] <= both[:, 1]).all():  # otherwise no pose suits both legs, and each is a limb of its own
                 other, signs, ranges = legs[partner], mirrored, both
                 taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))

@@ -33,11 +33,11 @@ class Leg:
     links: list[int]
     """Links of the tree from the base's child to the foot."""
     hinges: list[str]
-    """Names of the hinges along them."""
+    """Names of the hinges along the links."""
     tip: Vector
     """(3,) lowest point of the leg, in the frame of its last link."""
     feet: list[Shape]
-    """Shapes of its last link that touch the ground."""
+    """Shapes of the last link that touch the ground."""
 
     @property
     def end(self) -> int:

@@ -148,7 +148,7 @@ FITS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
 }
 ROUND = 1.25
-"""A mesh counts as round if its largest extent is at most its smallest times this factor."""
+"""Factor: a mesh counts as round if its largest extent is at most this factor times its smallest extent."""
 
 
 def fitted(shape: Shape) -> Shape:

@@ -103,7 +103,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     try:
         return spec.compile()
     except Exception as error:
-        for key in list(spec.keys):  # keyframes of another size were written for a scene with more in it
+        for key in list(spec.keys):  # keyframes of another size belong to a scene with more joints
             spec.delete(key)
         try:
             return spec.compile()
@@ -240,7 +240,9 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
 
 
 def _smaller(limits: np.ndarray) -> float | None:
-    """Return the end of a range that is nearer to 0, or the other one if that is 0; None if it is no finite limit."""
+    """Return the end of a range that is nearer to 0, or the farther end if the nearer one is 0; None if the result is not a
+    finite limit.
+    """
     size = float(min(abs(limits[0]), abs(limits[1])) or max(abs(limits[0]), abs(limits[1])))
     return size if 0.0 < size < 1e5 else None
 

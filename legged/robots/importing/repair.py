@@ -85,8 +85,8 @@ def fix(link: Link, hinge: Hinge, angle: float) -> None:
 
 
 def _hold_what_is_light(tree: Tree, light: float) -> None:
-    """Hold joints that move no mass, neither their own link's nor another's, and joints of fingers, which name and mass
-    identify.
+    """Hold joints that move no mass, neither their own link's nor another's, and joints of fingers, which are recognised by
+    name and mass.
     """
     moved = [link.mass for link in tree.links]
     for i in reversed(range(1, len(tree.links))):

@@ -62,15 +62,15 @@ class Hinge:
     range: tuple[float, float] | None = None
     """[rad]; None for a hinge without limits."""
     effort: float | None = None
-    """Torque limit of its motor [N m]; None if the file states none."""
+    """Torque limit of the hinge's motor [N m]; None if the file states none."""
     velocity: float | None = None
     """Speed limit [rad/s]."""
     driven: bool = True
-    """True if it has a motor."""
+    """True if the hinge has a motor."""
     stiffness: float | None = None
     """P gain of a position actuator [N m/rad]."""
     damping: float | None = None
-    """D gain of its actuators [N m s/rad]."""
+    """D gain of the hinge's actuators [N m s/rad]."""
     passive: dict[str, float] = field(default_factory=dict)
     """MJCF attributes of the joint itself: damping, armature, frictionloss, stiffness, springref."""
 
@@ -162,7 +162,7 @@ class Tree:
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Make the pose of a link at zero angles the one that `hinge` gives it at `angle` [rad]. The hinges of the link before
+    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. The hinges of the link before
     that one stay where they are, and their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
