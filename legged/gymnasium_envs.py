@@ -76,7 +76,8 @@ class _Driver:
         with self._own_random_numbers():
             self.task: Any = make_task(cfg, self._device, graph=False)
             """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
-            # On a GPU the captured step includes the copies of final states; on the CPU no graph needs a check.
+            # On a GPU the captured step includes the copies of final states; on the CPU the step needs no check for a
+            # capture.
             self._final = keep_final_step(self.task, graph=self._device.type == "cuda")
             # The initial state, with the buffers that terms create at their first call: a step is made and undone.
             before = self.task.state_dict()
@@ -290,7 +291,9 @@ class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
 
 
 def as_numpy(value: Any) -> Any:
-    """Return a tensor, or the tensors of a dictionary, as arrays; those of tensors on the CPU share their memory."""
+    """Return a tensor, or the tensors of a dictionary, as arrays. The array of a tensor on the CPU shares the tensor's
+    memory.
+    """
     if isinstance(value, dict):
         return {name: as_numpy(part) for name, part in value.items()}
     return value.cpu().numpy() if isinstance(value, Tensor) else value

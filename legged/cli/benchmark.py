@@ -82,7 +82,7 @@ def _add_arguments(parser: CommandParser) -> None:
 
 def _add_steps(parser: CommandParser) -> None:
     _add_arguments(parser)
-    parser.add_argument("--steps", type=int, default=200, help="control steps a measurement; 200 by default")
+    parser.add_argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default")
 
 
 def _add_step_arguments(parser: CommandParser) -> None:
@@ -171,7 +171,7 @@ def step(args: argparse.Namespace) -> int:
     if args.kernels is not None and device.type != "cuda":
         raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
     if args.kernels is not None and args.policy is not None:
-        raise ConfigError("--kernels: lists what is launched under random actions; leave it or --policy out")
+        raise ConfigError("--kernels: lists the launches under random actions; leave out either --kernels or --policy")
     settle_on(device)
     count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
     policy = None
@@ -387,7 +387,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # it takes minutes on a CPU
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # takes minutes on a CPU
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
     turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]

@@ -77,7 +77,7 @@ def whole_parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = load(name).build_parser()
-        for action in parser._actions if name != "migrate" else ():  # its tasks are names of legged_gym
+        for action in parser._actions if name != "migrate" else ():  # tasks of `migrate` are names of legged_gym
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}

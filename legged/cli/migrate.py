@@ -40,7 +40,7 @@ def build_parser() -> CommandParser:
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes")
     parser.add_argument("--run", action="store_true", help="run the file and the modules that it imports")
-    parser.add_argument("--task", help="which of its classes or registered tasks; or how the only one is to be called")
+    parser.add_argument("--task", help="class or registered task to migrate, or a name for the only one")
     parser.add_argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the files that are written")
     parser.add_argument("--force", action="store_true", help="write over files of the same names")

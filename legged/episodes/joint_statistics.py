@@ -143,8 +143,8 @@ def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None
 
 
 def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
-    """Return title -> table, one a quantity: a line a joint, mean and standard deviation of each policy, and of two policies
-    the difference of their means; last, a table of gait cycles if there are any.
+    """Return title -> table, one table for each quantity, with one line for each joint: mean and standard deviation of each
+    policy, and for two policies the difference of their means. The last table is on gait cycles, if there are any.
 
     Raises:
         ConfigError: two policies have other joints.
@@ -153,7 +153,7 @@ def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
     one, other = several[0].joints, several[-1].joints
     if one != other:
         differing = ", ".join([name for name in (*one, *other) if (name in one) != (name in other)][:4]) or "in another order"
-        raise ConfigError(f"POLICY: the two have other joints ({differing}); take policies of one robot")
+        raise ConfigError(f"POLICY: the two have other joints ({differing}); name policies of the same robot")
     names = [f", {label}" if len(found) > 1 else "" for label in found]
     for name, title in _measured(found):
         heads = ["joint", *(f"{what}{of}" for of in names for what in ("mean", "standard deviation"))]

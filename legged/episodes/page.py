@@ -31,7 +31,7 @@ from legged.rendering.camera import RobotsCamera, camera_of
 WIDTH, HEIGHT = 640, 360
 """Size of a picture [pixels]."""
 FPS, MOST_PICTURES = 25.0, 400
-"""Pictures a second, and most pictures of an episode; longer episodes have fewer a second."""
+"""Pictures per second, and the largest number of pictures of an episode; longer episodes have fewer per second."""
 FILL, GLIDE = 0.5, 0.3
 """Share of the picture that a robot fills, and share of the distance to it that the camera moves in a picture."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)
@@ -96,7 +96,7 @@ def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, 
 
 
 class Projector:
-    """Renderer of recorded episodes; builds their task once, with one robot in the C engine."""
+    """Renderer of recorded episodes. The task of the episodes is built once, with one robot in the C engine."""
 
     def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
         """Build the task that `cfg` describes, on the ground of the episodes.
@@ -302,7 +302,8 @@ class Panels:
 
 def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
     """Return the groups of joints whose names differ only in the words for a leg, in order: their common name, and
-    their numbers. A joint without others is a group, and so is each of more than `MOST_LINES`.
+    their numbers. A joint without such partners is a group of its own. Joints of a group with more than `MOST_LINES` form
+    separate groups.
     """
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):

@@ -280,12 +280,12 @@ class Quantity:
 
     name: str
     read: Callable[[], Tensor]
-    """Return its current values (N, ...)."""
+    """Return the current values (N, ...)."""
     unit: str
     what: str
-    """Description, with the frame if it has one."""
+    """Description, with the frame if the quantity has one."""
     columns: tuple[str, ...] = ()
-    """Names along its second axis, if it has one."""
+    """Names along the second axis of the values, if there is one."""
 
 
 def quantities_of(task: BaseTask) -> list[Quantity]:
@@ -298,7 +298,9 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
 
     return [
         Quantity("qpos", lambda: physics.qpos, "m, rad", "generalised positions in MuJoCo's layout", _coordinates(model, 0)),
-        Quantity("qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, likewise", _coordinates(model, 1)),
+        Quantity(
+            "qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, MuJoCo's layout", _coordinates(model, 1)
+        ),
         Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
         Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; below 0 it may have been cut off"),
         Quantity("reward_parts", lambda: rewards.last.t(), "1", "scale times term of this step", rewards.names),
@@ -359,7 +361,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
         Quantity("command", lambda: task.commands[:, :3], velocity, commanded, ("vx", "vy", "yaw")),
         Quantity("feet_pos", lambda: task.feet_pos, "m", "centres of the feet, world frame, by x, y, z", feet),
         Quantity("feet_force", lambda: task.contact_forces.index_select(1, columns), "N", force, feet),
-        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 where a foot touches, or did a step before", feet),
+        Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 in contact, now or in the previous step", feet),
         Quantity("contact_force", lambda: task.contact_forces.norm(dim=2), "N", sizes, shapes),
     ]
 

@@ -28,7 +28,7 @@ AXES = ("x", "y", "z")
 DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
 """Errors that json, zipfile and NumPy raise for damaged files."""
 FORMAT = 1
-"""Version of episodes.json; it grows when older files can no longer be read."""
+"""Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
 """Arrays with a row an episode: its first row (and the row behind the last episode); the robot that ran it; flags of an end
 by a failure, of an end by time or a term that is no failure, and of all terms, in the order of `terminations`; positions and

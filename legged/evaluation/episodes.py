@@ -54,7 +54,7 @@ def environment_of(task: str) -> str:
     """
     found = getattr(task_class(task), "GYMNASIUM_ID", None)
     if not isinstance(found, str):
-        raise ConfigError(f"POLICY: '{task}' is not a task of Gymnasium: its class {task_class(task).__name__} names none")
+        raise ConfigError(f"POLICY: '{task}' is not a task of Gymnasium: {task_class(task).__name__} has no GYMNASIUM_ID")
     return found
 
 

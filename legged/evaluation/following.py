@@ -52,7 +52,7 @@ def evaluate_following(
             tracking = {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **tracking}}
         del task, act  # a GPU may not hold two
     success = success_over_difficulty(setting, sizes, robots) if sizes else None
-    # The screen comes first: a full disk cannot take it away.
+    # Results are printed first, so that a full disk cannot lose them.
     shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
     if tracking:
         print_tracking(shown)
@@ -101,7 +101,7 @@ def cross(setting: Setting, grid: Grid) -> int:
         try:
             write_result(path, result)
             failure = None
-        except RunError as error:  # the table is printed all the same, and the disk may have room later
+        except RunError as error:  # the table is still printed, and the disk may have room later
             failure = error
     Console(width=110).print(crossing_table(result))
     if failure is not None:
@@ -132,7 +132,7 @@ def _measured(setting: Setting, grid: Grid) -> dict[str, Any]:
 
 
 def crossing_table(result: dict[str, Any]) -> Table:
-    """Return a table with a line an engine; an engine in which every robot fell early has no errors."""
+    """Return a table with one line for each engine. An engine in which every robot fell early has no errors."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
     forms = {"rmse_lin": "{:.3f} m/s", "rmse_ang": "{:.3f} rad/s", "falls": "{:.1f} %"}
@@ -146,7 +146,7 @@ def crossing_table(result: dict[str, Any]) -> Table:
 
 
 def draw_crossing(result: dict[str, Any], path: Path) -> None:
-    """Draw bars, one an engine: errors, falls, speed."""
+    """Draw bars, one for each engine: errors, falls, speed."""
     rows = result["engines"]
     names = [row["physics"] for row in rows]
     panels = (

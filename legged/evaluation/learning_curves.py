@@ -32,7 +32,7 @@ CURRICULUM = {
     "Metrics/command_vy": ("largest commanded vy [m/s]", 1.0),
     "Metrics/command_yaw": ("largest commanded yaw rate [rad/s]", 1.0),
 }
-"""The same for the ranges of a curriculum of commands."""
+"""Tag, title and factor of the ranges of a curriculum of commands."""
 LEARNER = {
     "Policy/mean_std": ("standard deviation of actions (noise)", 1.0),
     "Loss/value": ("loss of the value function", 1.0),
@@ -221,7 +221,9 @@ def _several(quantities: dict[str, tuple[str, float]], runs: Named, **how: Any) 
 def _one(
     tag: str, title: str, runs: Named, factor: float = 1.0, exact: bool = False, markers: bool = False, **look: Any
 ) -> list[Chart]:
-    """Return the chart of one quantity, a line a run, as running means unless `exact`; no chart if no run logged it."""
+    """Return the chart of one quantity, a line for each run, as running means unless `exact`; no chart if no run logged
+    it.
+    """
     lines = []
     for i, (label, run) in enumerate(runs):
         steps, values = run.scalars.get(tag, (np.array([]), np.array([])))

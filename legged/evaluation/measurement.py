@@ -64,7 +64,7 @@ class Setting:
 
 
 class Overflows:
-    """Counter of lost contacts: robots times control steps. The task starts its own count anew with every rollout it logs."""
+    """Counter of lost contacts: robots times control steps. The task's own count restarts with every rollout that it logs."""
 
     NAME = "Metrics/contact_overflows"
 
@@ -72,7 +72,7 @@ class Overflows:
         self._logged: list[Tensor] = []
 
     def add(self, extras: dict[str, Any]) -> None:
-        """Keep what a step returned, if it closed a rollout."""
+        """Add the count that a step returned, if the step ended a rollout."""
         if "log" in extras:
             self._logged.append(extras["log"][self.NAME])
 

@@ -209,8 +209,8 @@ def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robo
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
-    """Run all robots out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a robot
-    lost contacts.
+    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a
+    robot lost contacts.
     """
     place(task, robots)
     task.reset()
@@ -294,7 +294,7 @@ def _on_type(
 
 
 def print_success(success: dict[str, Any]) -> None:
-    """Print a table with a line a point; sizes harder than those of training are marked."""
+    """Print a table with a line for each point; sizes harder than those of training are marked."""
     rule, beyond = success["definition"], False
     title = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
     rows: list[list[str] | None] = []
@@ -340,14 +340,16 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
 
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:
-    """Draw success over size with its intervals into a PNG file: a panel a kind of terrain, a line a type and an engine."""
+    """Draw success over size with its intervals into a PNG file: a panel for each kind of terrain, a line for each type and
+    engine.
+    """
     rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
     reached = f"get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
     draw_charts(success_charts(results), path, f"{results[0]['task']}: robots that {reached}\n{robots} robots a point")
 
 
 def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
-    """Return a chart a kind of terrain: success over size, one line a type and engine."""
+    """Return a chart for each kind of terrain: success over size, with one line for each type and engine."""
     found = []
     for title, types in panels_of([name for result in results for name in types_in(result)]).items():
         lines = []

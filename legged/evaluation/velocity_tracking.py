@@ -68,7 +68,8 @@ def place_to_track(
 
 @torch.inference_mode()
 def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, Any]:
-    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
+    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, with one entry for each cell in
+    "cells".
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
     power of the cost of transport is that of the last physics step of each control step, which is lower than the mean over
@@ -197,8 +198,8 @@ class EstimateMeter:
             self._counted += counted
 
     def found(self) -> dict[str, Any]:
-        """Return, as `estimates`, for each term the root mean square error of its numbers over robots and steps, with its
-        unit; null if no step was counted. Return nothing for a policy without an estimator.
+        """Return `estimates`: the root mean square error of each term over robots and steps, with its unit; null if no step
+        was counted. Return nothing for a policy without an estimator.
         """
         if not isinstance(self._network, EstimatingModel):
             return {}
@@ -248,7 +249,7 @@ def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing
+        warnings.simplefilter("ignore", RuntimeWarning)  # mean of no values
         return np.nanmean(values, axis=over)
 
 
@@ -263,7 +264,7 @@ def draw_tracking(result: dict[str, Any], path: Path) -> None:
             axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
             axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
             axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
-            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # of nothing, where all robots fell
+            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # mean of no values, where all robots fell
             for (i, j), value in np.ndenumerate(values):
                 dark = value > 0.6 * largest
                 axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")

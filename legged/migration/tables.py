@@ -84,7 +84,7 @@ OF_RECURRENT = {
     "policy.rnn_hidden_size": "train.policy.rnn_hidden_dim",
     "policy.rnn_num_layers": "train.policy.rnn_num_layers",
 }
-"""More such settings, if `runner.policy_class_name` is recurrent."""
+"""Settings of recurrent policies (`runner.policy_class_name`) -> setting here of the same meaning."""
 
 RANDOM_MODEL = (
     ("link_mass", "link_mass_range", ("link_mass",)),

@@ -86,7 +86,7 @@ class Video:
         if self.camera is None or self.folder is None:
             return
         self.camera.close()
-        if self.gif:  # first: it needs no encoder
+        if self.gif:  # written first, because it needs no encoder
             every = max(1, round(self.fps / GIF_FPS))
             shown = [resized(frame, *GIF_SIZE) for frame in self.frames[: max(1, round(GIF_S * self.fps)) : every]]
             write_film(shown, self.folder / "play.gif", self.fps / every)
@@ -164,7 +164,7 @@ def write_mp4(frames: Film, path: Path, fps: float) -> None:
         RunError: the film cannot be written.
     """
     try:
-        import imageio_ffmpeg  # nothing but a film needs it
+        import imageio_ffmpeg  # only films need imageio
 
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:

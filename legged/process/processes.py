@@ -48,7 +48,7 @@ class Job:
     kind: Kind
     command: list[str]
     output: Path
-    """File for its standard output and errors."""
+    """File for the process's standard output and errors."""
     done: Callable[["Job", int], Iterable["Job"]]
     """Function that is called with the job and its exit code, and returns the jobs that follow."""
     told: bool = False
@@ -85,7 +85,7 @@ class Job:
 class WorkerPool:
     """Pool that runs jobs until the queue is empty. A job that fails does not end the others.
 
-    Trainings start in the order of the queue. Each starts when the one before it has built its task, so that start-up
+    Trainings start in the order of the queue. Each starts when the previous training has built its task, so that start-up
     overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
     """
 

@@ -29,7 +29,7 @@ OFFERS = frozenset({"base_lin_vel", "heights"})
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 """Warnings of MuJoCo that accompany a reset of the state."""
 FALLEN = 1.2
-"""Lean of the base above which the robot has fallen [rad]."""
+"""Tilt of the base above which the robot has fallen [rad]."""
 OURS = "control.actuator"
 """Section of a configuration about the motors."""
 
@@ -82,7 +82,7 @@ class Motors:
         self._varies = cfg.delay_varies
         self.delay = self._draw()
         """Present delay of a command [steps]."""
-        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # from the one that has arrived to the newest
+        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # from the last arrived command on
         self._network: ActuatorNetwork | None = None
         if cfg.network:
             weights = NetworkWeights.load(cfg.network)

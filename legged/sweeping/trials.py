@@ -74,7 +74,7 @@ class Trials:
                 self.study.set_user_attr(SWEEP, plan.identity)
                 if None not in plan.own_drawn.values():
                     self.study.enqueue_trial(plan.own_drawn, skip_if_exists=True)
-        except Exception as error:  # of SQLAlchemy, drivers and file systems, each of its own kind
+        except Exception as error:  # SQLAlchemy, drivers and file systems raise their own classes
             raise RunError(f"sweep: the storage can't be used: {' '.join(str(error).split())[:300]}") from error
         if known not in (None, plan.identity):
             raise ConfigError(
@@ -246,7 +246,7 @@ def _machine() -> str:
 
 
 def _began(pid: int) -> str:
-    """Return the start of a process of this machine, in the system's unit; 'gone' if there is no such process."""
+    """Return the start time of a process on this machine, in the system's unit; 'gone' if there is no such process."""
     with suppress(OSError):
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return "gone" if fields[0] in "ZX" else fields[19]
@@ -389,7 +389,7 @@ def draw_figures(trials: Trials) -> list[Path]:
     from optuna.importance import PedAnovaImportanceEvaluator
     from optuna.visualization import matplotlib as drawing
 
-    plt.switch_backend("agg")  # no window system is asked
+    plt.switch_backend("agg")  # draw without a window system
     plan, study = trials.plan, trials.study
     ranked = ranking(plan, trials.all)
     own = own_trial(plan, ranked)

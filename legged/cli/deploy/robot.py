@@ -50,7 +50,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--contract", type=Path, help=trained)
     out = f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
     parser.add_argument("--out", type=Path, help=out)
-    parser.add_argument("--seconds", type=float, default=3600.0, help="end after so long; default 3600")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600")
     return parser
 
 

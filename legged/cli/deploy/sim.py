@@ -152,7 +152,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         RunError: the simulated robot does not start, fails, or does not end.
     """
     report = folder / REPORT
-    report.unlink(missing_ok=True)  # the report of another run
+    report.unlink(missing_ok=True)  # remove the report of an earlier run
     simulated = [sys.executable, "-m", "legged", "deploy", "robot", robot, "--out", str(folder)]
     simulated += [*(["--ideal-motors"] if args.ideal_motors else []), "--contract", str(exported / "policy.json")]
     simulator = subprocess.Popen(

@@ -37,7 +37,7 @@ from legged.evaluation.tables import screen_table
 Key = tuple[str, str, str]
 """Task, engine, and conditions that differ from the policy's own or between evaluations."""
 Evaluations = dict[Key, list[dict[str, Any]]]
-"""Key -> results, one a seed."""
+"""Key -> results, one for each seed."""
 FIGURES = {
     "velocity RMSE, mean [m/s]": ("rmse_lin.mean", 1.0, ".3f"),
     "velocity RMSE, worst cell [m/s]": ("rmse_lin.worst", 1.0, ".3f"),
@@ -53,7 +53,7 @@ Measured = tuple[float, Interval | None] | None
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
-    """Remove all terrain types but `types` from the results, and order them so.
+    """Keep only the terrain types `types` in the results, in that order.
 
     Raises:
         ConfigError: no result has a type.
@@ -69,8 +69,8 @@ def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
-    """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of their
-    first.
+    """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of the first
+    result of each group.
     """
     grids = [grid_text(result) for result in results]
     told = len(set(grids) - {""}) > 1
@@ -88,7 +88,9 @@ def spread(values: Sequence[float]) -> float:
 
 
 def tracking_table(groups: Evaluations) -> ScreenTable:
-    """Return a table with a column a group: the mean over its seeds and the farthest seed's distance from it."""
+    """Return a table with one column for each group: the mean over its seeds, and the distance of the farthest seed from
+    it.
+    """
     rows = []
     for label, (path, factor, form) in FIGURES.items():
         row = [label]
@@ -101,7 +103,7 @@ def tracking_table(groups: Evaluations) -> ScreenTable:
 
 
 def episodes_comparison(groups: Evaluations) -> ScreenTable:
-    """Return a table of evaluations of episodes with a column a group: the mean over its seeds and their range."""
+    """Return a table of evaluations of episodes with one column for each group: the mean over its seeds and their range."""
     found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
     rows = []
     for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
@@ -119,7 +121,7 @@ def _heads(groups: Evaluations) -> list[str]:
 
 
 def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
-    """Return a mean; in brackets the spread of several values, and their number if not all seeds have one."""
+    """Return a mean as text. Brackets hold the spread of several values, and their number if some seeds lack a value."""
     notes = [spread_text] if len(values) > 1 else []
     notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
     return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
@@ -151,7 +153,7 @@ def heading(key: Key, seeds: int) -> str:
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> success of every seed that was measured on a type, for the sizes that all of them have."""
+    """Return size -> success of every seed that was measured on a type, for the sizes that these seeds share."""
     entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
@@ -165,7 +167,7 @@ def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
 
 
 def success_table(groups: Evaluations) -> ScreenTable:
-    """Return a table with a line a type and size: the mean success over seeds and their range."""
+    """Return a table with one line for each type and size: the mean success over seeds and their range."""
     rows: list[list[str] | None] = []
     for name, entry in types_of(groups).items():
         columns = [(shares(results, name), len(results)) for results in groups.values()]
@@ -178,7 +180,9 @@ def success_table(groups: Evaluations) -> ScreenTable:
 
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
-    """Draw success into a PNG file: a panel a terrain type, a line a group, with a band from the worst to the best seed."""
+    """Draw success into a PNG file: a panel for each terrain type, a line for each group, with a band from the worst to the
+    best seed.
+    """
     charts = []
     for name in types_of(groups):
         lines = []
@@ -267,7 +271,9 @@ def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
 
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
-    """Return the table of one engine: a line a measure, a column a run, and one for each difference from the first run."""
+    """Return the table of one engine: a line for each measure, a column for each run, and a column for each difference from
+    the first run.
+    """
     measures: dict[str, tuple[Callable[[dict[str, Any]], Counted], str, float]] = {
         "velocity RMSE [m/s]": (partial(_errors, "rmse_lin"), ".3f", 1.0),
         "yaw rate RMSE [rad/s]": (partial(_errors, "rmse_ang"), ".3f", 1.0),

@@ -32,7 +32,7 @@ LONGEST_VALUE = 60
 DEEPEST = 3
 """Levels of folders in which runs are searched: logs, tasks, runs."""
 QUIET_S = 3600.0
-"""A training that has written nothing for this long has ended, even if a process has its number [s]."""
+"""A training that has written nothing for this long has ended, even if a process with its number exists [s]."""
 QUIET_ELSEWHERE_S = 120.0
 """The same for a training on another machine [s]."""
 

@@ -54,7 +54,7 @@ NICENESS = 10
 FILMING: list[subprocess.Popen] = []
 """Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
-"""Most letters of a difference in the page; its file holds all of it."""
+"""Largest number of letters of a code difference in the page; its file holds the whole text."""
 ON_GRID = (
     "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
     " interval of falls is Wilson's. A cell of the maps is the mean over the third command."

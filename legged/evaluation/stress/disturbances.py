@@ -21,7 +21,7 @@ from legged.robots.similarity import Size, grown
 from legged.terrain import Terrain
 
 WRITTEN_FOR = "anymal_c"
-"""Robot of the numbers below; they are scaled for others."""
+"""Robot for which the numbers below are written. They are scaled for other robots."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
     """Return all lines for a robot of that size: no disturbance, each alone, some together, all. `anymal` is the size of the
-    robot of the numbers; scaled numbers have two digits. A `payload` [kg] replaces that of the table.
+    robot for which the numbers are written; scaled numbers have two digits. A `payload` [kg] replaces that of the table.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:

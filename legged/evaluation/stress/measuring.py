@@ -58,7 +58,8 @@ COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; robots have them in turn."""
+"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; they are given to the robots
+in turn."""
 Changes = Sequence[tuple[str, Any]]
 """Overrides of a configuration."""
 HALF_STEP = "half the time step"
@@ -128,7 +129,7 @@ class Bench:
         self.limit = LIMIT * sqrt(self.scale)
         """Largest error of a robot that follows its command [m/s]."""
         self.lost = 0
-        """Number of control steps in which a robot lost contacts for want of memory."""
+        """Number of control steps in which a robot lost contacts because memory was full."""
 
     @property
     def on_plane(self) -> bool:
@@ -196,7 +197,7 @@ class Bench:
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
     def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
+        """Return the outcomes (N,) of robots that are distributed over tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
@@ -344,7 +345,7 @@ def share_text(entry: dict[str, Any]) -> str:
 
 
 def draw_stress(result: dict[str, Any], path: Path) -> None:
-    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity error there."""
+    """Draw a bar for each line, with its interval: success, commands followed on the flat, and the velocity error there."""
     rows = rows_of(result)
     names = [name for _, name, *_ in rows]
     colors = [COLORS[kind] for kind, *_ in rows]

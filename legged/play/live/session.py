@@ -132,7 +132,7 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
     """Return overrides for that many robots, undisturbed except for the overrides in `asked`."""
     if isinstance(cfg, LeggedConfig):
-        keep_length = len(grounds_of(cfg)) == 1  # it ends at the edge of the tile, or a little before
+        keep_length = len(grounds_of(cfg)) == 1  # the episode ends at the edge of the tile, or a little before
         seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
         return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
     return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
