@@ -20,7 +20,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 from legged.cli.listing import robots, tasks
-from legged.cli.main import COMMANDS
+from legged.cli.main import COMMANDS, load
 from legged.config.reference import FieldText, fields
 from legged.config.schema import LeggedConfig
 
@@ -118,9 +118,10 @@ def tasks_page() -> str:
 def commands_page() -> str:
     """Return the page with what every command says of itself, its examples first."""
     lines = ["# Commands", "", "`legged --help` lists them; `python -m legged` is the same command."]
-    pages = {module: summary for module, summary in COMMANDS.values()} | {"legged.deploy.__main__": "run a policy on a robot"}
-    for module, summary in pages.items():
-        parser = import_module(module).build_parser()
+    pages = [(load(name), summary) for name, (_, summary) in COMMANDS.items() if name != "runs"]  # the same as `runs table`
+    pages.append((import_module("legged.deploy.__main__"), "run a policy on a robot"))
+    for command, summary in pages:
+        parser = command.build_parser()
         lines += ["", f"## {parser.prog}", "", f"{summary}.", "", "```", *parser.examples, "```", ""]
         lines += ["| argument | |", "|---|---|", *_arguments(parser)]
     return "\n".join(lines)

@@ -35,6 +35,10 @@ class TermError(RuntimeError):
     """Failure of a term's method, such as `_reward_*` or `_obs_*`. The text names the method."""
 
 
+class HostReadError(RuntimeError):
+    """Error for code of the step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
+
+
 def suggest(name: str, allowed: Iterable[str], what: str = "allowed") -> str:
     """Return '; did you mean ...?' with the name in `allowed` that is nearest to `name`, if any, then all allowed names in
     brackets after the word `what`.

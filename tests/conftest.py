@@ -3,6 +3,7 @@
 import legged.process.headless  # noqa: F401, I001  (chooses how to render, before MuJoCo is imported)
 
 import functools
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from importlib.util import find_spec
@@ -19,6 +20,7 @@ from legged.physics.fused.torque_step import TorqueStep
 from legged.process import neighbours
 from legged.robots.robot import Robot, load_robot
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for programs in the background
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
 
 collect_ignore = [] if find_spec("hypothesis") else ["fuzz"]

@@ -1,6 +1,7 @@
 """Rules about the code itself: how long files are, those of the tests too, and which way imports point."""
 
 import ast
+import functools
 import sys
 from pathlib import Path
 
@@ -20,6 +21,7 @@ def name_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@functools.cache
 def imports(path: Path) -> set[str]:
     """Modules that a file imports anywhere in it, functions and annotations included, as dotted names."""
     found: set[str] = set()
@@ -45,18 +47,15 @@ def test_the_rules_are_applied_to_all_of_the_package():
     assert uses(PACKAGE / "cli" / "train.py", "legged.learning", "torch", "warp") == {"legged.learning", "torch"}
 
 
-@pytest.mark.parametrize("path", [*FILES, *TESTS], ids=lambda path: path.relative_to(PACKAGE.parent).as_posix())
-def test_no_file_is_too_long_to_read(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= LONGEST
+def test_no_file_is_too_long_to_read():
+    lines = {path.as_posix(): len(path.read_text(encoding="utf-8").splitlines()) for path in [*FILES, *TESTS]}
+    assert not {path: count for path, count in lines.items() if count > LONGEST}
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_warp_is_known_to_the_physics_and_to_the_graph_only(path):
-    name = name_of(path)
-    if not name.startswith("legged.physics"):
-        assert not uses(path, "mujoco_warp")
-        if name != "legged.graph.step_graph":
-            assert not uses(path, "warp")
+def test_warp_is_known_to_the_physics_and_to_the_graph_only():
+    outside = [path for path in FILES if not name_of(path).startswith("legged.physics")]
+    assert not {name_of(path) for path in outside if uses(path, "mujoco_warp")}
+    assert {name_of(path) for path in outside if uses(path, "warp")} <= {"legged.graph.step_graph"}
 
 
 FLOORS = [  # from the ground up; each part imports from the floors below it only
@@ -72,7 +71,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"commandline"},
     {"learning", "rendering", "deploy"},
     {"policies", "gymnasium_envs"},
-    {"play", "benchmarks"},
+    {"play"},
     {"evaluation"},
     {"episodes", "fitting", "migration", "simulated_robot"},
     {"sweeping"},

@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from helpers import POLICY
 from legged import registry
 from legged.cli import play, train
 from legged.cli.evaluate import grid, terrain
-from legged.cli.main import COMMANDS, split
+from legged.cli.main import COMMANDS, load, split
 from legged.deploy import __main__ as program
 from legged.process.command_parser import CommandParser
 from legged.registry import import_tasks, make_task, task_config
@@ -120,7 +119,7 @@ def parser_for(words: list[str]) -> tuple[CommandParser | None, list[str]]:
         words = words[3:] if words[0] == "python" else words[1:]
     name, rest = split(words)
     if name is not None:
-        return import_module(COMMANDS[name][0]).build_parser(), rest
+        return load(name).build_parser(), rest
     groups = {name.partition(" ")[0] for name in COMMANDS}
     rest = words[1:] if words and words[0] in groups else words
     if any(word != "--help" and not PLACEHOLDER.fullmatch(word) for word in rest):

@@ -18,7 +18,7 @@ from legged.errors import ConfigError
 from legged.play.walking_film import Film, film, walker, write_film
 from legged.policies.restore import TrainedPolicy, policy_of
 from legged.process.command_parser import CommandParser, add_import_argument
-from legged.process.paths import ready_to_write_file
+from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
 from legged.rendering.camera import INK
 
@@ -51,7 +51,11 @@ def build_parser() -> CommandParser:
 
 def _main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
-    ready_to_write_file("--out", args.out, 4.0, (".gif", ".png"))
+    if args.out.suffix not in (".gif", ".png"):
+        raise ConfigError(f"--out: must end in .gif or .png, got '{args.out.name}'")
+    if args.out.is_dir():
+        raise ConfigError(f"--out: {args.out} is a folder; expected a file")
+    ready_to_write(args.out.parent, 4.0)
     if args.columns is not None and args.columns < 1:
         raise ConfigError(f"--columns: must be at least 1, got {args.columns}")
     if not SMALLEST <= args.side <= LARGEST:

@@ -22,8 +22,7 @@ from shipping import ship
 
 from legged.cli.evaluate.common import ROBOTS, check_points
 from legged.commandline.arguments import pick_device
-from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.stopping import stopping_on_signals
+from legged.commandline.command import EXIT_FAILED, run_main, stopping_on_signals
 from legged.config import LeggedConfig, override, parse_override
 from legged.errors import ConfigError, suggest
 from legged.evaluation.engines import ENGINES
@@ -35,8 +34,8 @@ from legged.learning.timing import read_timing
 from legged.process.command_parser import CommandParser, add_import_argument
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
+from legged.process.processes import Job, Kind, WorkerPool, why_failed
 from legged.process.ranks import Ranks
-from legged.process.worker_pool import Job, Kind, WorkerPool, why_failed
 from legged.registry import YAML_ENDINGS, import_tasks, register_file, task_config
 
 OUT = Path("logs") / "zoo"

@@ -1,8 +1,4 @@
-"""Print a completion script for a shell: `legged completion bash > ~/.legged-completion`.
-
-The script completes commands, options, tasks, runs, and dotted keys of the configuration (`train.runner.<TAB>`). Source it in
-the shell's start-up file, and write it again after an update of the package.
-"""
+"""`legged completion`: a script that completes commands, options, tasks, runs and keys of the configuration."""
 
 import argparse
 import shlex
@@ -11,12 +7,11 @@ from importlib import import_module
 
 import shtab
 
-from legged.cli.main import COMMANDS
-from legged.commandline.command import command
+from legged.cli.main import COMMANDS, load
+from legged.commandline.command import sub_command
 from legged.config.reference import fields
 from legged.envs import BaseTask, LeggedRobot
 from legged.physics.fields import FIELDS
-from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder
 from legged.registry import CLASSES
 from legged.terrain import TERRAIN_TYPES
@@ -55,26 +50,21 @@ _legged_complete_keys() { compadd -S '' -- ${(f)"$(_legged_next_keys "$PREFIX")"
 """
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged completion",
-        __doc__,
-        "legged completion bash > ~/.legged-completion",
-        "legged completion zsh > ~/.legged-completion",
-    )
-    parser.add_argument("shell", choices=("bash", "zsh"), help="the shell that reads the script")
-    return parser
+@sub_command(
+    "legged completion bash > ~/.legged-completion",
+    "legged completion zsh > ~/.legged-completion",
+    add=lambda parser: parser.add_argument("shell", choices=("bash", "zsh"), help="the shell that reads the script"),
+)
+def completion(args: argparse.Namespace) -> int:
+    """Print a completion script for a shell: `legged completion bash > ~/.legged-completion`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    shell = build_parser().parse_args(argv).shell
+    The script completes commands, options, tasks, runs, and dotted keys of the configuration (`train.runner.<TAB>`). Source
+    it in the shell's start-up file, and write it again after an update of the package.
+    """
     kinds = [getattr(import_module(module), name) for name, module in CLASSES.items()]
     lists = SCRIPT.format(cfg=shlex.quote(str(data_folder("cfg"))), keys="\n".join(keys_of(kinds)))
-    print(shtab.complete(whole_parser(), shell, preamble=lists + (IN_BASH if shell == "bash" else IN_ZSH)))
-    if shell == "bash":
+    print(shtab.complete(whole_parser(), args.shell, preamble=lists + (IN_BASH if args.shell == "bash" else IN_ZSH)))
+    if args.shell == "bash":
         print(LAST_IN_BASH)
     return 0
 
@@ -84,9 +74,9 @@ def whole_parser() -> argparse.ArgumentParser:
     whole = argparse.ArgumentParser("legged")
     commands = whole.add_subparsers()
     groups: dict[str, argparse._SubParsersAction] = {}
-    for name, (module, summary) in COMMANDS.items():
+    for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
-        parser = import_module(module).build_parser()
+        parser = load(name).build_parser()
         for action in parser._actions if name != "migrate" else ():  # its tasks are names of legged_gym
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"

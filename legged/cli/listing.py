@@ -3,9 +3,11 @@
 The lists are read from the files' comments, which is fast.
 """
 
+from itertools import takewhile
 from pathlib import Path
 
-from legged.commandline.light import answer, print_rows
+from legged.cli.main import print_rows
+from legged.commandline.command import command
 from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder
 
@@ -17,17 +19,15 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def main(argv: list[str] | None = None) -> int:
+@command
+def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     what = build_parser().parse_args(argv).what
-    return answer(lambda: _list(what))
-
-
-def _list(what: str | None) -> None:
-    if what in (None, "tasks"):
+    if what != "robots":
         print_rows("tasks, each for `legged train TASK`", tasks())
-    if what in (None, "robots"):
+    if what != "tasks":
         print_rows("robots, each for `robot: NAME` in a task's file", robots())
+    return 0
 
 
 def tasks() -> dict[str, str]:
@@ -43,9 +43,5 @@ def robots() -> dict[str, str]:
 
 def _comment(path: Path) -> str:
     """Return the comment at the head of a YAML file, without line ends."""
-    found: list[str] = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            break
-        found.append(line.lstrip("# "))
-    return " ".join(found)
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
+    return " ".join(line.lstrip("# ") for line in lines)

@@ -8,8 +8,9 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from typing import Any
 
-from legged.commandline.light import answer, print_rows
+from legged.commandline.command import run_main
 from legged.errors import ConfigError, suggest
 
 SECTIONS = {
@@ -43,25 +44,25 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "episodes list": ("legged.cli.episodes.stored", "list recorded episodes, make pages of them"),
     "episodes statistics": ("legged.cli.episodes.statistics", "mean and standard deviation of every joint"),
     "episodes compare": ("legged.cli.episodes.compare", "joint statistics of two policies side by side"),
-    "sweep run": ("legged.cli.sweep.run", "search settings by many trainings"),
-    "sweep report": ("legged.cli.sweep.report", "table and figures of a sweep"),
-    "benchmark step": ("legged.cli.benchmark.step", "times of a control step and of training iterations"),
-    "benchmark scale": ("legged.cli.benchmark.scale", "speed against the number of robots"),
-    "benchmark ground": ("legged.cli.benchmark.ground", "speed on a plane, on terrain and with general contacts"),
-    "benchmark startup": ("legged.cli.benchmark.startup", "how long a training takes to begin"),
-    "robot add": ("legged.cli.robot.add", "turn a URDF or MJCF file into a robot and a task"),
-    "robot show": ("legged.cli.robot.show", "joints, limits, gains and feet of a robot"),
-    "terrain": ("legged.cli.terrain", "pictures of a task's terrain"),
+    "sweep run": ("legged.cli.sweep:run", "search settings by many trainings"),
+    "sweep report": ("legged.cli.sweep:report", "table and figures of a sweep"),
+    "benchmark step": ("legged.cli.benchmark:step", "times of a control step and of training iterations"),
+    "benchmark scale": ("legged.cli.benchmark:scale", "speed against the number of robots"),
+    "benchmark ground": ("legged.cli.benchmark:ground", "speed on a plane, on terrain and with general contacts"),
+    "benchmark startup": ("legged.cli.benchmark:startup", "how long a training takes to begin"),
+    "robot add": ("legged.cli.robot:add", "turn a URDF or MJCF file into a robot and a task"),
+    "robot show": ("legged.cli.robot:show", "joints, limits, gains and feet of a robot"),
+    "terrain": ("legged.cli.terrain:terrain", "pictures of a task's terrain"),
     "export": ("legged.cli.export", "export every checkpoint of a run to ONNX"),
     "deploy sim": ("legged.cli.deploy.sim", "run the robot's program against a simulated robot"),
     "deploy robot": ("legged.cli.deploy.robot", "serve a simulated robot over UDP"),
     "fit-actuator": ("legged.cli.fit_actuator", "fit a motor model to a log of a real motor"),
     "migrate": ("legged.cli.migrate", "translate a legged_gym configuration"),
-    "warmup": ("legged.cli.warmup", "compile and cache the kernels of a task"),
-    "completion": ("legged.cli.completion", "print a completion script for a shell"),
+    "warmup": ("legged.cli.warmup:warmup", "compile and cache the kernels of a task"),
+    "completion": ("legged.cli.completion:completion", "print a completion script for a shell"),
     "list": ("legged.cli.listing", "list tasks and robots"),
 }
-"""Words of a command -> its module, which has `build_parser` and `main`, and a summary."""
+"""Words of a command -> its module, or a SubCommand in a module, and a summary. Both have `build_parser` and `main`."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -69,12 +70,18 @@ def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:
-        return answer(lambda: _print_help(words))
-    module = import_module(COMMANDS[name][0])
+        return run_main(lambda _: _print_help(words), argv)
+    found = load(name)
     if argv is not None:
-        return module.main(rest)  # type: ignore[no-any-return]
+        return found.main(rest)  # type: ignore[no-any-return]
     sys.argv = [sys.argv[0], *rest]
-    return module.main()  # type: ignore[no-any-return]
+    return found.main()  # type: ignore[no-any-return]
+
+
+def load(name: str) -> Any:
+    """Import a command; return its module or its SubCommand."""
+    module, _, inside = COMMANDS[name][0].partition(":")
+    return getattr(import_module(module), inside) if inside else import_module(module)
 
 
 def split(words: list[str]) -> tuple[str | None, list[str]]:
@@ -108,28 +115,32 @@ def sub_commands(group: str) -> list[str]:
     return [name.partition(" ")[2] for name in COMMANDS if name.startswith(f"{group} ")]
 
 
-def _print_help(words: list[str]) -> None:
-    """Print the commands, or those of a group.
+def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
+    """Print a title and two columns, names and texts; the first column has at least `width` letters."""
+    width = max([width, *map(len, rows)])
+    print(f"{title}:")
+    for name, summary in rows.items():
+        print(f"  {name:{width}}  {summary}".rstrip())
 
-    Raises:
-        ConfigError: the words name neither a command nor a group of commands.
-    """
-    groups = {name.partition(" ")[0] for name in COMMANDS if " " in name}
+
+def _print_help(words: list[str]) -> int:
+    """Print the commands, or those of a group; return the exit code 0. ConfigError names a word that is neither."""
+    groups: dict[str, dict[str, str]] = {}
+    for name, (_, summary) in COMMANDS.items():
+        groups.setdefault(name.partition(" ")[0], {})[name] = summary
     asked = [word for word in words if word not in ("--help", "-h")]
     if not asked:
         print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...  (each has --help)\n")
         for heading, firsts in SECTIONS.items():
-            rows = {name: said for name, (_, said) in COMMANDS.items() if name.partition(" ")[0] in firsts}
-            in_order = {name: rows[name] for first in firsts for name in rows if name.partition(" ")[0] == first}
-            print_rows(heading, in_order, max(map(len, COMMANDS)))
+            rows = {name: said for first in firsts for name, said in groups[first].items()}
+            print_rows(heading, rows, max(map(len, COMMANDS)))
             print()
         print("begin with `legged play anymal_c` (a trained policy), `legged train anymal_c_flat`, `legged list`")
-        return
+        return 0
     if asked[0] not in groups:
-        known = {name.partition(" ")[0] for name in COMMANDS}
-        raise ConfigError(f"legged: there is no command '{asked[0]}'{suggest(asked[0], known, 'commands')}")
+        raise ConfigError(f"legged: there is no command '{asked[0]}'{suggest(asked[0], groups, 'commands')}")
     if len(asked) > 1:
         near = suggest(asked[1], sub_commands(asked[0]), "sub-commands")
         raise ConfigError(f"legged {asked[0]}: there is no sub-command '{asked[1]}'{near}")
-    inside = {name: said for name, (_, said) in COMMANDS.items() if name.startswith(f"{asked[0]} ")}
-    print_rows(f"commands of `legged {asked[0]}`, each with --help", inside)
+    print_rows(f"commands of `legged {asked[0]}`, each with --help", groups[asked[0]])
+    return 0

@@ -1,8 +1,9 @@
-"""Translate a legged_gym configuration into a task: `legged migrate legged_gym/envs/go2/go2_config.py --robot go2`.
+"""Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
 
-The file and the files that it extends are read, not run; the classes of legged_gym itself are built in. The command writes
-<task>.yaml with the settings that differ from the defaults, and robots/<task>/robot.yaml if the robot's pose or contacts
-differ. It lists every setting without a counterpart, with file and line.
+The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and the like
+need not be installed. From the live classes it writes <task>.yaml with the settings that differ from the defaults, and
+robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are the fork's own, and
+lists every setting without a counterpart, with file and line.
 """
 
 import argparse
@@ -15,16 +16,18 @@ from legged.commandline.command import command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
-from legged.migration.choice import Choice, choose
 from legged.migration.mapping import map_settings
-from legged.migration.modules import Tree
+from legged.migration.reading import read_fork
 from legged.migration.robot_entries import asset_of, map_robot, names_of
-from legged.migration.translation import Lost, Translation
+from legged.migration.translation import Translation
 from legged.migration.writer import robot_yaml, task_yaml
 from legged.process.command_parser import CommandParser
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot
+
+FIRST = ("rewards", "observations", "robot")
+"""Subjects of the first lines of the report."""
 
 
 def build_parser() -> CommandParser:
@@ -32,10 +35,11 @@ def build_parser() -> CommandParser:
     parser = CommandParser(
         "legged migrate",
         __doc__,
-        "legged migrate legged_gym/envs/go2/go2_config.py --robot go2",
-        "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks",
+        "legged migrate legged_gym/envs/go2/go2_config.py --robot go2 --run",
+        "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks --run",
     )
     parser.add_argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes")
+    parser.add_argument("--run", action="store_true", help="run the file and the modules that it imports")
     parser.add_argument("--task", help="which of its classes or registered tasks; or how the only one is to be called")
     parser.add_argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the files that are written")
@@ -49,16 +53,18 @@ def main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
-    tree = Tree()
-    choice = choose(tree, args.file, args.task)
-    task = _task_name(choice.task)
-    result = map_settings(choice.environment, choice.learner)
+    if args.file.suffix != ".py":
+        raise ConfigError(f"file: expected a Python file with configuration classes, got {shown(str(args.file))}")
+    if not args.run:
+        raise ConfigError(
+            f"--run: legged migrate runs {relative(args.file)} and the modules that it imports; say --run for that"
+        )
+    fork = read_fork(args.file, args.task)
+    task = _task_name(fork.task)
+    result = map_settings(fork)
     robot = _robot(args.robot, result)
     entries = map_robot(result, robot)
-    # Notes about files without a configuration are left out: a loop there concerns no setting.
-    lost = [*(Lost(place, text, "", "") for place, text in tree.notes), *result.lost]
-    path = args.out / f"{task}.yaml"
-    folder = args.out / "robots" / task
+    path, folder = args.out / f"{task}.yaml", args.out / "robots" / task
     with_folder = robot is not None and bool(entries)
     for file in (path, *([folder / "robot.yaml"] if with_folder else [])):
         if exists(file) and not args.force:
@@ -66,16 +72,18 @@ def main(argv: list[str] | None) -> int:
     ready_to_write(args.out)
     make_folder(args.out)
     result.settings["robot"] = _robot_setting(robot, with_folder, task, result)
-    if with_folder:
-        assert robot is not None
+    if robot is not None and with_folder:
         make_folder(folder)
         write_text(folder / "robot.yaml", _robot_text(robot, entries, folder, args.file))
-    head = [f"Written by legged migrate from {relative(args.file)}, {_described(choice, tree)}."]
-    if robot is None and entries:
+    head = [f"Written by legged migrate from {relative(args.file)}, {fork.described}."]
+    head += [f"{subject}: {line}" for subject, lines in result.notes.items() for line in lines]
+    if robot is None:
+        result.note("robot", f"it does not exist here yet: {asset_of(result) or 'the configuration names no file'}")
         head += ["The robot of this task does not exist here yet. The configuration gives these entries of its robot.yaml:"]
         head += [f"  {line}" for line in robot_yaml([], entries).splitlines()]
-    write_text(path, task_yaml(head, result.settings, result.comments, lost))
-    _report(args, path, result, lost, robot)
+    minor = [f"without effect on a task: {', '.join(result.minor)}"] if result.minor else []
+    write_text(path, task_yaml(head, result.settings, result.comments, [*map(str, result.lost), *minor]))
+    _report(args, path, result, robot)
     return 0
 
 
@@ -86,24 +94,13 @@ def _task_name(name: str) -> str:
     return f"my_{name}" if exists(data_folder("cfg") / f"{name}.yaml") else name
 
 
-def _described(choice: Choice, tree: Tree) -> str:
-    parts = [choice.environment.__name__]
-    parts += [choice.learner.__name__] if choice.learner is not None else ["no learner's configuration"]
-    text = " and ".join(parts)
-    if tree.built_in:
-        text += f"; {', '.join(sorted(tree.built_in))} as legged_gym v1.0.2 has them"
-    return text
-
-
 def _robot(asked: str | None, result: Translation) -> Robot | None:
     """Return the robot `asked`, or the robot of this package with the name of the asset."""
     if asked is not None:
         return load_robot(asked, "--robot")
     robots = data_folder("resources") / "robots"
-    for name in names_of(result):
-        if is_plain_name(name) and exists(robots / name / "robot.yaml"):
-            return load_robot(name, "asset.name")
-    return None
+    names = (name for name in names_of(result) if is_plain_name(name) and exists(robots / name / "robot.yaml"))
+    return next((load_robot(name, "asset.name") for name in names), None)
 
 
 def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Translation) -> str:
@@ -130,24 +127,34 @@ def _asset(file: Path, result: Translation) -> str:
     return next(found, asset or "FILE.urdf")
 
 
-def _report(args: argparse.Namespace, path: Path, result: Translation, lost: list[Lost], robot: Robot | None) -> None:
+def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Robot | None) -> None:
+    """Print the file, the notes, the lost settings, and the next commands."""
     print(f"written: {relative(path)}, {len(result.settings)} settings that differ from the defaults")
-    for entry in lost:
-        print(f"not mapped: {entry}")
+    for subject in sorted(result.notes, key=lambda subject: (*FIRST, subject).index(subject)):
+        print(*(f"{subject}: {line}" for line in result.notes[subject]), sep="\n")
+    for name in filter(result.settings.__contains__, result.comments):
+        print(f"changed: {name} = {shown(result.settings[name])}: {result.comments[name]}")
+    for entry in filter(lambda entry: entry.reason, result.lost):
+        alike = [other for other in result.lost if other.reason == entry.reason]
+        if entry is alike[0]:
+            also = ", ".join(other.setting for other in alike[1:])
+            print(f"not mapped: {entry}{f'; also {also}' if also else ''}")
+    if not all(entry.reason for entry in result.lost):
+        plain = ", ".join(entry.setting for entry in result.lost if not entry.reason)
+        print(f"not mapped, without counterpart (places are in {path.name}): {plain}")
+    if result.minor:
+        print(
+            f"not mapped, without effect: {len(result.minor)} settings of the simulator, of drawing and of the command line"
+        )
     if robot is None:
         folder = args.out / result.settings["robot"]
         add = ["robot", "add", _asset(args.file, result), "--name", folder.name, "--out", str(folder.parent)]
-        again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force"]
+        again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force", "--run"]
         again += ["--task", args.task] if args.task else []
-        print(
-            "the robot is missing; add it:",
-            *(f"  legged {shlex.join(words)}" for words in (add, again)),
-            sep="\n",
-        )
+        print("the robot is missing; add it:", *(f"  legged {shlex.join(words)}" for words in (add, again)), sep="\n")
         return
     try:
-        name = register_file(str(path))
-        task_config(name)
+        task_config(register_file(str(path)))
     except ConfigError as error:
         print(f"it does not load yet: {error}")
         return

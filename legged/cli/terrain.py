@@ -1,9 +1,6 @@
-"""Pictures of a task's terrain: `legged terrain anymal_c`.
+"""`legged terrain`: pictures of a task's terrain."""
 
-terrain_map.png shows the whole grid of tiles from above, terrain.png one tile of each type with a robot on it. `--types`
-shows other types than the task's.
-"""
-
+import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +8,7 @@ from pathlib import Path
 from PIL import Image
 
 from legged.commandline.arguments import add_task_arguments, overrides, register_given
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.process.command_parser import CommandParser
@@ -21,25 +18,20 @@ from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles
 from legged.terrain import Terrain, check_terrain, terrain_types
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged terrain",
-        __doc__,
-        "legged terrain anymal_c",
-        "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7",
-    )
+def _add_arguments(parser: CommandParser) -> None:
     add_task_arguments(parser)
     parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
     parser.add_argument("--difficulty", type=float, default=0.5, help="of the tiles in the picture, 0 to 1")
     parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
-    return parser
 
 
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+@sub_command("legged terrain anymal_c", "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7", add=_add_arguments)
+def terrain(args: argparse.Namespace) -> int:
+    """Draw a task's terrain: `legged terrain anymal_c`.
+
+    terrain_map.png shows the whole grid of tiles from above, terrain.png one tile of each type with a robot on it. `--types`
+    shows other types than the task's.
+    """
     register_given(args, "task")
     if not 0.0 <= args.difficulty <= 1.0:
         raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")
@@ -54,18 +46,18 @@ def main(argv: list[str] | None) -> int:
                 " your choice"
             )
         check_terrain(cfg.terrain, cfg.origins)
-        terrain = Terrain.build(cfg.terrain, cfg.env.seed)
-        types: Sequence[str] = terrain.type_names
+        grid = Terrain.build(cfg.terrain, cfg.env.seed)
+        types: Sequence[str] = grid.type_names
         levels = [f"{row / cfg.terrain.num_rows:g}" if cfg.terrain.curriculum else "" for row in range(cfg.terrain.num_rows)]
     else:
         types = terrain_types("--types", args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
         check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
-        terrain = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
+        grid = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
         levels = [f"{args.difficulty:g}"]
     make_folder(args.out)
     map_path, picture_path = args.out / "terrain_map.png", args.out / "terrain.png"
-    draw_map(terrain, levels, map_path)
+    draw_map(grid, levels, map_path)
     with replacing(picture_path) as part:
         Image.fromarray(picture_of_types(cfg, types, args.difficulty)).save(part, format="PNG")
     print(f"written: {relative(map_path)}, {relative(picture_path)}")

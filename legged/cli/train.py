@@ -1,4 +1,4 @@
-"""Train a policy: `legged train anymal_c_flat`, or `python train.py --task anymal_c_flat`."""
+"""`legged train`: trainings from the command line."""
 
 import argparse
 import contextlib
@@ -8,7 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,12 +23,11 @@ from legged.commandline.arguments import (
     settle_on,
     watch_command,
 )
-from legged.commandline.command import EXIT_FAILED, run_main
-from legged.commandline.output import when_output_is_lost
+from legged.commandline.command import EXIT_FAILED, quiet_writers, stopping_on_signals, sub_command, when_output_is_lost
 from legged.commandline.show import summary
-from legged.commandline.stopping import quiet_writers, stopping_on_signals
 from legged.config import TaskConfig, to_yaml
 from legged.config.networks import learns_from_teacher
+from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.evaluation.during_training import TrainingEvaluation, check_commands
 from legged.learning.captured import CapturedRunner
@@ -51,33 +50,14 @@ from legged.process.cores import available_cores
 from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
-from legged.process.startup import STARTED_S, program, stage_ended
+from legged.process.startup import program, stage_ended
 from legged.registry import make_task, task_config
 
 ROOM_MB = 16.0
 """Disk space that must be free before a training begins, for its first checkpoints [MiB]."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    return run_main(_main, argv)
-
-
-Prepared = Callable[[Runner], None]
-"""Function that receives the runner after it is built and before it trains."""
-
-
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged train",
-        __doc__,
-        "legged train anymal_c_flat",
-        "legged train anymal_c --num-envs 8192 --seed 3 rewards.scales.torques=-1e-4",
-        "legged train anymal_c --resume",
-        "legged train anymal_c_step --transfer anymal_c_flat",
-        "legged train anymal_c_student --teacher anymal_c",
-    )
+def _add_arguments(parser: CommandParser) -> None:
     add_legged_gym_arguments(parser, "task")
     parser.add_argument("--resume", action="store_true", help="continue from a checkpoint, in a new run folder")
     parser.add_argument(
@@ -93,40 +73,35 @@ def build_parser() -> CommandParser:
     parser.add_argument(
         "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
     )
-    return parser
 
 
-def train_as_asked(argv: list[str], prepared: Prepared) -> int:
-    """Run a training with the arguments `argv` inside another command; return the exit code. Errors are raised.
-
-    Raises:
-        ConfigError: the command line or the configuration is wrong.
-        RunError: training could not go on.
-    """
-    return _main(argv, prepared)
-
-
-def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
-    start = STARTED_S if argv is None else time.perf_counter()  # the time of a command includes its imports
+@sub_command(
+    "legged train anymal_c_flat",
+    "legged train anymal_c --num-envs 8192 --seed 3 rewards.scales.torques=-1e-4",
+    "legged train anymal_c --resume",
+    "legged train anymal_c_step --transfer anymal_c_flat",
+    "legged train anymal_c_student --teacher anymal_c",
+    add=_add_arguments,
+)
+def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = None) -> int:
+    """Train a policy: `legged train anymal_c_flat`, or `python train.py --task anymal_c_flat`."""
+    # `prepared` receives the runner after it is built and before it trains.
     stage_ended("imports")
-    args = build_parser().parse_intermixed_args(argv)
-
     settle_name(args, "task")
     register_given(args, "task")
     device = pick_device(args.sim_device)
     rl_device = pick_device(args.rl_device, "--rl-device") if args.rl_device else device
-    checkpoint: Path | None = None
+    on_cpu, checkpoint = device.type == "cpu", None
     changed: list[str] = []
     if args.transfer:
         for option in ("resume", "load_run"):
             if getattr(args, option):
                 raise ConfigError(f"--{option.replace('_', '-')}: continues a training, --transfer begins one; give either")
-        on_cpu = device.type == "cpu"
         cfg, checkpoint = transferred(args.task, overrides(args), args.transfer, args.checkpoint, on_cpu)
     elif args.resume or args.load_run is not None or args.checkpoint is not None:
         cfg, checkpoint, changed = resumed(args.task, overrides(args), args.load_run, args.checkpoint)
     else:
-        cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+        cfg = task_config(args.task, overrides(args), on_cpu)
     teacher = teacher_of(cfg, checkpoint, args)
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     check_commands(cfg)
@@ -138,83 +113,68 @@ def _main(argv: list[str] | None, prepared: Prepared | None = None) -> int:
     if checkpoint and not args.transfer:
         print(f"going on with the settings of {relative(checkpoint.parent)}" + "".join(f"; {text}" for text in changed))
     settle_on(device)
-    if Ranks.now().first:
-        with Neighbours(_name_of(device)) as neighbours:
-            return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared, neighbours)
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
-        return _train(args, cfg, device, rl_device, checkpoint, teacher, start, prepared, None)
-
-
-def _train(
-    args: argparse.Namespace,
-    cfg: TaskConfig,
-    device: torch.device,
-    rl_device: torch.device,
-    checkpoint: Path | None,
-    teacher: Teacher | None,
-    start: float,
-    prepared: Prepared | None,
-    neighbours: Neighbours | None,
-) -> int:
-    """Build the task and train; return the exit code. Of several processes only the first has a run folder and a display."""
     first = Ranks.now().first
-    check_reachable(Ranks.now())
-    if first:
-        ready_to_write(experiment_folder(cfg), ROOM_MB)
+    with contextlib.ExitStack() as stack:
+        neighbours = stack.enter_context(Neighbours(_name_of(device))) if first else None
+        if not first:
+            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+        check_reachable(Ranks.now())
+        if first:
+            ready_to_write(experiment_folder(cfg), ROOM_MB)
         print(describe(cfg, device), flush=True)
-    task = make_task(cfg if teacher is None else with_teacher(cfg, teacher), device, graph=not args.no_graph)
-    if first and task.physics.why_c_engine:
-        print(f"C MuJoCo instead, which is faster here: {task.physics.why_c_engine}", flush=True)
-    if first and task.physics.why_library:
-        print(f"mujoco-warp's own launches: {task.physics.why_library}", flush=True)
-    for line in task.robot.adaptations if first and task.physics.robot_state is not None else ():
-        print(f"{task.robot.file.model}: {line}", flush=True)
-    with Display(cfg.task) if first else contextlib.nullcontext() as display:
-        kind = CapturedRunner if cfg.train.runner.loop == "captured" else Runner
-        if teacher is None:
-            runner = kind(task, None, str(rl_device), display)
-        else:
-            runner = StudentRunner(task, teacher, None, str(rl_device), display)
-            print(f"teacher: {teacher.told()}", flush=True)
-        if checkpoint and args.transfer:
-            print(runner.transfer(str(checkpoint)), flush=True)
-        elif checkpoint:
-            why_anew = runner.resume(str(checkpoint))
-            how = f"all robots begin anew: {why_anew}" if why_anew else "robots and random numbers go on where they were"
-            print(f"resumed {relative(checkpoint)} after iteration {runner.current_learning_iteration}; {how}", flush=True)
-        if cfg.train.runner.evaluate_interval:
-            _evaluate_during(runner, checkpoint if not args.transfer else None)
-        if prepared is not None:
-            prepared(runner)
-        runner.logger.neighbours = neighbours
-        ready = time.perf_counter()
-        resumed = checkpoint is not None and not args.transfer
-
-        def timing(finished: bool, error: str = "") -> Timing:
-            times = _timing(runner, device, ready - start, time.perf_counter() - start, finished, resumed)
-            return replace(times, error=error)
-
-        with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
-            try:
-                folder, finished = _learn(runner, cfg, display, args, timing, checkpoint if resumed else None)
-            except RankLost as lost:
-                print(lost, file=sys.stderr, flush=True)
-                return EXIT_FAILED
-            except KeyboardInterrupt:
-                if not stopped_by:
-                    raise
-                print("interrupted", file=sys.stderr, flush=True)
-                return 128 + stopped_by[-1]
-    if folder:
-        took = timing(finished)
-        _summary(runner, folder, took, play_command(args, cfg, folder))
-        write_timing(folder, took)
-        _report(folder, cfg, args if finished else None)
-        runner.logger.hand_over(runner.current_learning_iteration)
+        task = make_task(cfg if teacher is None else with_teacher(cfg, teacher), device, graph=not args.no_graph)
+        with Display(cfg.task) if first else contextlib.nullcontext() as display:
+            runner = _runner(task, teacher, rl_device, display)
+            if checkpoint and args.transfer:
+                print(runner.transfer(str(checkpoint)), flush=True)
+            elif checkpoint:
+                why = runner.resume(str(checkpoint))
+                how = f"all robots begin anew: {why}" if why else "robots and random numbers go on where they were"
+                after = f"after iteration {runner.current_learning_iteration}"
+                print(f"resumed {relative(checkpoint)} {after}; {how}", flush=True)
+            training = _Training(args, cfg, device, runner, None if args.transfer else checkpoint)
+            if cfg.train.runner.evaluate_interval:
+                runner.evaluate_with(training.evaluations() if first else None)
+            if prepared is not None:
+                prepared(runner)
+            runner.logger.neighbours = neighbours
+            training.ready_s = time.perf_counter()
+            with stopping_on_signals(runner.stop) as stopped_by, quiet_writers():
+                try:
+                    folder, finished = training.learn(display)
+                except RankLost as lost:
+                    print(lost, file=sys.stderr, flush=True)
+                    return EXIT_FAILED
+                except KeyboardInterrupt:
+                    if not stopped_by:
+                        raise
+                    print("interrupted", file=sys.stderr, flush=True)
+                    return 128 + stopped_by[-1]
+        if folder:
+            training.close(folder, finished)
     if finished:
         return 0
     # No signal of this process: its output was lost, or another process was told to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+build_parser, main = train.build_parser, train.main
+
+
+def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:
+    """Build the training loop, and print how the task is simulated and taught."""
+    physics = task.physics
+    if physics.why_c_engine:
+        print(f"C MuJoCo instead, which is faster here: {physics.why_c_engine}", flush=True)
+    if physics.why_library:
+        print(f"mujoco-warp's own launches: {physics.why_library}", flush=True)
+    for line in task.robot.adaptations if physics.robot_state is not None else ():
+        print(f"{task.robot.file.model}: {line}", flush=True)
+    if teacher is not None:
+        print(f"teacher: {teacher.told()}", flush=True)
+        return StudentRunner(task, teacher, None, str(rl_device), display)
+    kind = CapturedRunner if task.cfg.train.runner.loop == "captured" else Runner
+    return kind(task, None, str(rl_device), display)
 
 
 def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespace) -> Teacher | None:
@@ -232,86 +192,123 @@ def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespac
     return find_teacher(cfg) if checkpoint is None else teacher_in(checkpoint, read_checkpoint(checkpoint))
 
 
-def _evaluate_during(runner: Runner, resumed_from: Path | None) -> None:
-    """Set up evaluations of the policy during the training, in the first process."""
-    evaluations = None
-    if Ranks.now().first:
-        evaluations = Evaluations(runner.env.cfg, TrainingEvaluation(runner.env))
-        if resumed_from is not None:
-            evaluations.go_on_from(resumed_from)
-    runner.evaluate_with(evaluations)
+@dataclass
+class _Training:
+    """A training that has been built, in one of its processes. The first has a run folder and a display."""
 
+    args: argparse.Namespace
+    cfg: TaskConfig
+    device: torch.device
+    runner: Runner
+    resumed_from: Path | None
+    """Checkpoint of the training that is continued."""
+    ready_s: float = 0.0
+    """Time at which everything was built, on the clock of `time.perf_counter` [s]."""
 
-def _learn(
-    runner: Runner,
-    cfg: TaskConfig,
-    display: Display | None,
-    args: argparse.Namespace,
-    timing: Callable[[bool, str], Timing],
-    goes_on_from: Path | None,
-) -> tuple[Path | None, bool]:
-    """Train into a new run folder; return the folder (None if another process has it) and True if training reached its end.
+    def evaluations(self) -> Evaluations:
+        """Return evaluations of the policy during the training, continued where the earlier training ended."""
+        evaluations = Evaluations(self.runner.env.cfg, TrainingEvaluation(self.runner.env))
+        if self.resumed_from is not None:
+            evaluations.go_on_from(self.resumed_from)
+        return evaluations
 
-    A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its times
-    into the folder. `goes_on_from` is the checkpoint of a resumed training.
+    def learn(self, display: Display | None) -> tuple[Path | None, bool]:
+        """Train into a new run folder; return the folder (None if another process has it) and True if training reached its
+        end.
 
-    Raises:
-        RunError: the folder can't be written.
-    """
-    folder = create_run(cfg) if display else None
-    if folder is None or display is None:
-        return None, runner.train(cfg.train.runner.max_iterations)
-    given = Invocation(args.task_file or args.task, args.module, dict(overrides(args)))
-    write_invocation(folder, given, goes_on_from.parent if goes_on_from is not None else None)
-    if args.note is not None:
-        write_text(folder / NOTE_FILE, f"{args.note}\n")
-    print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
-    display.title = f"{cfg.task}: {relative(folder)}"
-    if runner.evaluations is not None:
-        runner.evaluations.begin_in(folder)
-    runner.logger.log_dir = str(folder)
-    when_output_is_lost(runner.stop)
-    try:
-        return folder, runner.train(cfg.train.runner.max_iterations)
-    except BaseException as error:
-        if runner.logger.writer is not None:
-            with contextlib.suppress(OSError):
-                runner.logger.stop_logging_writer()
-        discard_run(folder)
-        if folder.is_dir():
-            _leave_word(folder, error, cfg, timing)
-        full = full_disk_in(error)
-        if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not name the file
-            raise RunError(f"{relative(folder)}: {reason(full)}") from error
-        raise
+        A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its
+        times into the folder.
 
+        Raises:
+            RunError: the folder can't be written.
+        """
+        runner, args, cfg = self.runner, self.args, self.cfg
+        if display is None:
+            return None, runner.train(cfg.train.runner.max_iterations)
+        folder = create_run(cfg)
+        given = Invocation(args.task_file or args.task, args.module, dict(overrides(args)))
+        write_invocation(folder, given, self.resumed_from.parent if self.resumed_from is not None else None)
+        if args.note is not None:
+            write_text(folder / NOTE_FILE, f"{args.note}\n")
+        print(f"run folder {relative(folder)}\nwatch it: {watch_command(args, folder)}", flush=True)
+        display.title = f"{cfg.task}: {relative(folder)}"
+        if runner.evaluations is not None:
+            runner.evaluations.begin_in(folder)
+        runner.logger.log_dir = str(folder)
+        when_output_is_lost(runner.stop)
+        try:
+            return folder, runner.train(cfg.train.runner.max_iterations)
+        except BaseException as error:
+            if runner.logger.writer is not None:
+                with contextlib.suppress(OSError):
+                    runner.logger.stop_logging_writer()
+            discard_run(folder)
+            if folder.is_dir():
+                said = "" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
+                # A full disk may prevent that, and the name of a broken CUDA device can't be read.
+                with contextlib.suppress(RunError, RuntimeError):
+                    write_timing(folder, self.timing(False, " ".join(said.split())[:500]))
+                    self._report(folder, film=False)
+            full = full_disk_in(error)
+            if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not name the file
+                raise RunError(f"{relative(folder)}: {reason(full)}") from error
+            raise
 
-def _leave_word(folder: Path, error: BaseException, cfg: TaskConfig, timing: Callable[[bool, str], Timing]) -> None:
-    """Write the error and the report into the folder of a failed training; a full disk may prevent that."""
-    said = "" if isinstance(error, KeyboardInterrupt) else " ".join(f"{type(error).__name__}: {error}".split())[:500]
-    with contextlib.suppress(RunError, RuntimeError):  # the name of a broken CUDA device can't be read
-        write_timing(folder, timing(False, said))
-        _report(folder, cfg, None)
+    def timing(self, finished: bool, error: str = "") -> Timing:
+        """Return the times of the training and its number of steps."""
+        runner, logger, now_s = self.runner, self.runner.logger, time.perf_counter()
+        if logger.neighbours is not None:
+            logger.neighbours.look()
+        return Timing(
+            task=runner.env.cfg.task,
+            finished=finished,
+            robots=runner.env.num_envs * Ranks.now().count,
+            iterations=logger.tot_timesteps // logger.steps_per_iteration,
+            resumed=self.resumed_from is not None,
+            steps=logger.tot_timesteps,
+            start_up_s=self.ready_s - self.args.start_s,
+            loop_s=logger.loop_s,
+            wall_s=now_s - self.args.start_s,
+            device=torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "cpu",
+            kernels_compiled=runner.env.physics.compiled,
+            beside=logger.neighbours.most if logger.neighbours is not None else 0,
+            error=error,
+            evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
+        )
 
+    def close(self, folder: Path, finished: bool) -> None:
+        """Print a summary of the training, and write its times and the report into the run folder."""
+        runner, timing = self.runner, self.timing(finished)
+        if runner.evaluations is not None:
+            print(*runner.evaluations.summary(timing.loop_s), sep="\n")
+        print(
+            f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
+            f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s"
+            f"{timing.company}), {timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
+            f"checkpoint in {relative(folder)}; see it walk: {play_command(self.args, self.cfg, folder)}",
+            flush=True,
+        )
+        write_timing(folder, timing)
+        self._report(folder, film=finished)
+        runner.logger.hand_over(runner.current_learning_iteration)
 
-def _report(folder: Path, cfg: TaskConfig, args: argparse.Namespace | None) -> None:
-    """Write the report on a training that has ended, unless its configuration switches reports off. The film needs the
-    arguments with which the task is found again, so without `args` there is no film.
-    """
-    if not cfg.train.runner.report:
-        return
-    from legged.evaluation.reports.run_report import report_at_end  # imported late, because a start does not need it
+    def _report(self, folder: Path, film: bool) -> None:
+        """Write the report on a training that has ended, unless its configuration switches reports off."""
+        if self.cfg.train.runner.report:
+            from legged.evaluation.reports.run_report import report_at_end  # imported late: a start does not need it
 
-    film_with = None
-    if args is not None and cfg.train.runner.film:
-        film_with = given_import(args)
-    report_at_end(folder, film_with)
+            # The arguments with which the process that makes the film finds the task.
+            report_at_end(folder, given_import(self.args) if film and self.cfg.train.runner.film else None)
 
 
 def describe(cfg: TaskConfig, device: torch.device) -> str:
     """Return one line about the task, the number of iterations and the device."""
+
+    def counted(count: int, noun: str) -> str:
+        return f"{count} {noun}{'s' if count != 1 else ''}"
+
     if device.type == "cpu":
-        cores = _counted(cfg.sim.threads or available_cores(), "core")
+        cores = counted(cfg.sim.threads or available_cores(), "core")
         engines = {"mujoco_warp": f"mujoco-warp on {cores}", "mujoco": f"C MuJoCo on {cores}"}
         name = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
         engine = engines.get(name, f"Newton's {cfg.sim.solver} solver on the CPU")
@@ -320,14 +317,9 @@ def describe(cfg: TaskConfig, device: torch.device) -> str:
             where += ", settings of the task's cpu section"
     else:
         where = torch.cuda.get_device_name(device)
-    ranks = Ranks.now()
-    share = f" on each of {ranks.count} processes" if ranks.several else ""
-    robots = f"{_counted(cfg.env.num_envs, 'robot')}{share}"
-    return f"{cfg.task}: {robots}, {_counted(cfg.train.runner.max_iterations, 'iteration')}, {where}"
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' if count != 1 else ''}"
+    share = f" on each of {Ranks.now().count} processes" if Ranks.now().several else ""
+    iterations = counted(cfg.train.runner.max_iterations, "iteration")
+    return f"{cfg.task}: {counted(cfg.env.num_envs, 'robot')}{share}, {iterations}, {where}"
 
 
 def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str:
@@ -345,37 +337,3 @@ def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str
 def _name_of(device: torch.device) -> str:
     """Return the name of a device that is unique on this machine."""
     return f"gpu-{torch.cuda.get_device_properties(device).uuid}" if device.type == "cuda" else "cpu"
-
-
-def _timing(runner: Runner, device: torch.device, start_up_s: float, wall_s: float, finished: bool, resumed: bool) -> Timing:
-    """Return the times of the training and its number of steps."""
-    steps, neighbours = runner.logger.tot_timesteps, runner.logger.neighbours
-    if neighbours is not None:
-        neighbours.look()
-    return Timing(
-        task=runner.env.cfg.task,
-        finished=finished,
-        robots=runner.env.num_envs * Ranks.now().count,
-        iterations=steps // runner.logger.steps_per_iteration,
-        resumed=resumed,
-        steps=steps,
-        start_up_s=start_up_s,
-        loop_s=runner.logger.loop_s,
-        wall_s=wall_s,
-        device=torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu",
-        kernels_compiled=runner.env.physics.compiled,
-        beside=neighbours.most if neighbours is not None else 0,
-        evaluation_s=runner.evaluations.spent_s if runner.evaluations is not None else 0.0,
-    )
-
-
-def _summary(runner: Runner, folder: Path, timing: Timing, play: str) -> None:
-    if runner.evaluations is not None:
-        print(*runner.evaluations.summary(timing.loop_s), sep="\n")
-    print(
-        f"{'finished' if timing.finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
-        f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s"
-        f"{timing.company}), {timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
-        f"checkpoint in {relative(folder)}; see it walk: {play}",
-        flush=True,
-    )

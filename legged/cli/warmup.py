@@ -1,36 +1,21 @@
-"""Compile and cache the kernels of a task: `legged warmup anymal_c`.
+"""`legged warmup`: kernels are compiled before a training."""
 
-The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all of its kernels for this
-machine's GPU, or for its CPU with sim.physics=mujoco_warp, and the next training starts without compiling.
-"""
-
+import argparse
 import time
 
 from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.physics import kernel_cache, resolve_physics
-from legged.process.command_parser import CommandParser
-from legged.process.startup import STARTED_S
 from legged.registry import make_task, task_config
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged warmup",
-        __doc__,
-        "legged warmup anymal_c",
-        "legged warmup go2_flat --num-envs 8192",
-    )
-    add_task_arguments(parser)
-    return parser
+@sub_command("legged warmup anymal_c", "legged warmup go2_flat --num-envs 8192", add=add_task_arguments)
+def warmup(args: argparse.Namespace) -> int:
+    """Compile and cache the kernels of a task: `legged warmup anymal_c`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    start = STARTED_S if argv is None else time.perf_counter()
-    args = build_parser().parse_intermixed_args(argv)
+    The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all of its kernels for this
+    machine's GPU, or for its CPU with sim.physics=mujoco_warp, and the next training starts without compiling.
+    """
     register_given(args, "task")
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
@@ -39,5 +24,5 @@ def main(argv: list[str] | None) -> int:
         return 0
     settle_on(device)
     make_task(cfg, device, graph=not args.no_graph)
-    print(f"{cfg.task}: ready in {time.perf_counter() - start:.1f} s, its kernels are in {kernel_cache()}")
+    print(f"{cfg.task}: ready in {time.perf_counter() - args.start_s:.1f} s, its kernels are in {kernel_cache()}")
     return 0

@@ -74,15 +74,11 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
     override_is_no_name(args, name)
     given = getattr(args, name)
     if given is not None and args.task_option not in (None, given):
-        raise ConfigError(
-            f"--task: '{args.task_option}' is given together with {name.upper()} '{given}'; leave one of them out"
-        )
-    found = given if given is not None else args.task_option
-    if found is None:
-        raise ConfigError(
-            f"{name.upper()}: is missing; name {'a task' if name == 'task' else 'a task or a run'}, e.g. anymal_c"
-        )
-    setattr(args, name, found)
+        raise ConfigError(f"--task: '{args.task_option}' is given together with {name.upper()} '{given}'; leave one out")
+    if given is None and args.task_option is None:
+        wanted = "a task" if name == "task" else "a task or a run"
+        raise ConfigError(f"{name.upper()}: is missing; name {wanted}, e.g. anymal_c")
+    setattr(args, name, args.task_option if given is None else given)
 
 
 def override_is_no_name(args: argparse.Namespace, name: str) -> None:
@@ -94,15 +90,9 @@ def override_is_no_name(args: argparse.Namespace, name: str) -> None:
 
 
 def _iteration(text: str) -> int | str:
-    """Return the iteration of a checkpoint, or `best`.
-
-    Raises:
-        ArgumentTypeError: the text is neither; argparse reports it.
-    """
-    if text == "best":
-        return text
+    """Return the iteration of a checkpoint, or `best`; argparse reports any other text."""
     try:
-        return int(text)
+        return text if text == "best" else int(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
 
@@ -124,11 +114,9 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
         "physics": "sim.physics",
         "solver": "sim.solver",
     }
+    given = {key: getattr(args, flag, None) for flag, key in flags.items()}
     found = [parse_override(text) for text in args.overrides]
-    for flag, key in flags.items():
-        value = getattr(args, flag, None)
-        if value is not None:
-            found.append((key, value))
+    found += [(key, value) for key, value in given.items() if value is not None]
     engine = dict(found).get("sim.physics")
     if args.solver is not None and engine != "newton":
         raise ConfigError(f"--solver: '{args.solver}' is an option of newton; add --physics newton (got {engine})")
@@ -150,34 +138,31 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     Raises:
         ConfigError: there is no such device, there is no GPU, or under torchrun another GPU is requested than the process's.
     """
-    ranks = Ranks.now()
+    ranks, gpus = Ranks.now(), torch.cuda.device_count()
     own = f"cuda:{ranks.local_rank}"
-    if name is None:
-        if not torch.cuda.is_available():
-            return torch.device("cpu")
+    if name is None and not torch.cuda.is_available():
+        return torch.device("cpu")
+    if name is None or (ranks.several and name == "cuda"):
         name = own
-    if ranks.several and name not in ("cpu", "cuda", own):
+    if ranks.several and name not in ("cpu", own):
         raise ConfigError(f"{flag}: '{name}' is one device for {ranks.count} processes; leave it out, and each gets its own")
-    if ranks.several and name == own and ranks.local_rank >= torch.cuda.device_count():
-        have = torch.cuda.device_count()
+    if ranks.several and name == own and 0 < gpus <= ranks.local_rank:
         raise ConfigError(
-            f"{ranks.local_count} processes want a GPU each, but torch sees {have} here; --nproc-per-node {have}"
+            f"{ranks.local_count} processes want a GPU each, but torch sees {gpus} here; --nproc-per-node {gpus}"
         )
-    if ranks.several and name == "cuda":
-        name = own
     try:
         device = torch.device(name)
     except RuntimeError as error:
         raise ConfigError(f"{flag}: '{name}' is not a device (allowed: cpu, cuda, cuda:0, ...)") from error
-    if device.type not in ("cpu", "cuda"):
+    if device.type == "cpu":
+        return device
+    if device.type != "cuda":
         raise ConfigError(f"{flag}: '{name}' is not supported (allowed: cpu, cuda, cuda:0, ...)")
-    if device.type == "cuda":
-        if not torch.cuda.is_available():
-            raise ConfigError(f"{flag}: '{name}' was asked for, but torch sees no GPU here; leave it out to use the CPU")
-        if (device.index or 0) >= torch.cuda.device_count():
-            raise ConfigError(f"{flag}: '{name}': this machine has {torch.cuda.device_count()} GPU(s), counted from 0")
-        return torch.device("cuda", device.index or 0)
-    return device
+    if not torch.cuda.is_available():
+        raise ConfigError(f"{flag}: '{name}' was asked for, but torch sees no GPU here; leave it out to use the CPU")
+    if (device.index or 0) >= gpus:
+        raise ConfigError(f"{flag}: '{name}': this machine has {gpus} GPU(s), counted from 0")
+    return torch.device("cuda", device.index or 0)
 
 
 def settle_on(device: torch.device) -> None:

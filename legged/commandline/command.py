@@ -1,30 +1,44 @@
-"""Execution of a command: its exit code, and its error message in one line."""
+"""Execution of a command: exit code, error message in one line, lost output, and signals."""
 
+import argparse
 import errno
 import functools
+import inspect
+import os
 import re
+import signal
 import sys
 import sysconfig
+import threading
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Protocol
+from types import FrameType
+from typing import Any, TextIO
 
 import legged.errors
-from legged.commandline.output import forgiving_output
-from legged.errors import ConfigError, RunError, TermError
-from legged.graph.step_graph import HostReadError
-from legged.physics.engine_warnings import each_warning_once
-from legged.process.paths import full_disk_in, reason
+from legged.errors import ConfigError, HostReadError, RunError, TermError
+from legged.process.command_parser import CommandParser
+from legged.process.paths import DISK_FULL, full_disk_in, reason
 from legged.process.ranks import Ranks
-from legged.process.startup import INTERRUPTED, is_a_command, leave_at_interrupts, raise_at_interrupts
-from legged.user_modules import is_of_a_module
+from legged.process.startup import (
+    INTERRUPTED,
+    STARTED_S,
+    in_main_thread,
+    is_a_command,
+    leave_at_interrupts,
+    raise_at_interrupts,
+)
 
 EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
 NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
 """Pattern in the messages of torch, Warp, NumPy and C++ about too little memory."""
+SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+"""Signals from Ctrl-C, from a scheduler, and from a terminal that is closed."""
 
 
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
@@ -37,7 +51,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     if argv is None:
         is_a_command()
         raise_at_interrupts()
-    with forgiving_output() as output, each_warning_once():
+    with forgiving_output() as output, _engine_warnings():
         leaves = None
         try:
             code = _guarded(main, argv)
@@ -54,21 +68,53 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
     return code
 
 
-class Command(Protocol):
-    """The main function of a command."""
+def _engine_warnings() -> AbstractContextManager[None]:
+    """Return a context in which each kind of MuJoCo's warnings is printed once; help and lists do without MuJoCo."""
+    if "mujoco" not in sys.modules:
+        return nullcontext()
+    from legged.physics.engine_warnings import each_warning_once
 
-    def __call__(self, argv: list[str] | None = None) -> int:
+    return each_warning_once()
+
+
+def command(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
+    """Let the main function of a command end as `run_main` describes. Its argument may be left out then."""
+    return functools.partial(run_main, main)
+
+
+class SubCommand:
+    """A command that is a function of parsed arguments: `legged <module> <function>`, or `legged <module>` if it is called
+    like its module. In the arguments, `words` is the whole command line, and `start_s` the start of the command on the clock
+    of `time.perf_counter` [s]; the start of a process includes its imports.
+    """
+
+    def __init__(self, run: Callable[..., int], examples: Sequence[str], add: Callable[[CommandParser], object]) -> None:
+        self.run, self._examples, self._add = run, examples, add
+
+    def build_parser(self) -> CommandParser:
+        """Return the parser of the command line."""
+        words = dict.fromkeys((self.run.__module__.rpartition(".")[2], self.run.__name__))
+        parser = CommandParser(" ".join(["legged", *words]), inspect.getdoc(self.run), *self._examples)
+        self._add(parser)
+        return parser
+
+    def parse(self, argv: list[str] | None) -> argparse.Namespace:
+        """Return the arguments of a command line, of this process if None."""
+        args = self.build_parser().parse_intermixed_args(argv)
+        args.words = sys.argv[1:] if argv is None else argv
+        args.start_s = STARTED_S if argv is None else time.perf_counter()
+        return args  # type: ignore[no-any-return]
+
+    def main(self, argv: list[str] | None = None) -> int:
         """Run the command with these arguments, those of this process if None; return its exit code."""
+        return run_main(lambda words: self.run(self.parse(words)), argv)
 
 
-def command(main: Callable[[list[str] | None], int]) -> Command:
-    """Let the main function of a command end as `run_main` describes."""
-
-    @functools.wraps(main)
-    def run(argv: list[str] | None = None) -> int:
-        return run_main(main, argv)
-
-    return run
+def sub_command(*examples: str, add: Callable[[CommandParser], object]) -> Callable[[Callable[..., int]], SubCommand]:
+    """Make a function of parsed arguments a sub-command, whose exit code it returns. Its docstring is the description of the
+    help, which ends with `examples`; `add` adds its arguments to the parser.
+    """
+    return lambda run: SubCommand(run, examples, add)
 
 
 def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:
@@ -93,25 +139,25 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
             print("interrupted", file=sys.stderr, flush=True)
             return INTERRUPTED
         text = known_failure(error)
-        if text is None and is_of_a_module(_file_of(error)):
+        if text is None:
+            from legged.user_modules import is_of_a_module  # imported late, because help and lists do not need it
+
+            if not is_of_a_module(_file_of(error)):
+                raise
             _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
             return EXIT_WRONG_INPUT
-        if text is None:
-            raise
         _say(text)
     return EXIT_FAILED
 
 
-def line_of_user(error: BaseException) -> str:
+def line_of_user(error: BaseException | None) -> str:
     """Return ' (file, line n)' of the innermost line of user code in the traceback of `error`."""
-    found = ""
-    behind: BaseException | None = error
-    while behind is not None:
-        for frame in traceback.extract_tb(behind.__traceback__):
-            if _is_of_user(frame):
-                found = f" ({frame.filename}, line {frame.lineno})"
-        behind = behind.__cause__
-    return found
+    frames: list[traceback.FrameSummary] = []
+    while error is not None:
+        frames += traceback.extract_tb(error.__traceback__)
+        error = error.__cause__
+    users = [frame for frame in frames if _is_of_user(Path(frame.filename))]
+    return f" ({users[-1].filename}, line {users[-1].lineno})" if users else ""
 
 
 def _file_of(error: BaseException) -> str:
@@ -122,9 +168,8 @@ def _file_of(error: BaseException) -> str:
     return frames[-1].filename
 
 
-def _is_of_user(frame: traceback.FrameSummary) -> bool:
-    """Return True if a line belongs neither to this package, nor to a library, nor to Python."""
-    file = Path(frame.filename)
+def _is_of_user(file: Path) -> bool:
+    """Return True if a file belongs neither to this package, nor to a library, nor to Python."""
     libraries = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(sysconfig.get_path("stdlib"))
     return not libraries and not file.is_relative_to(Path(legged.errors.__file__).parent) and file.is_file()
 
@@ -133,11 +178,11 @@ def known_failure(error: BaseException) -> str | None:
     """Return one line about a full disk, a file that can't be written or too little memory, whatever library reported it;
     None for all other errors.
     """
-    full = full_disk_in(error)
-    if full is not None:
-        return f"{full.filename}: {reason(full)}" if full.filename else reason(full)
-    if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EMFILE)):
-        return f"{error.filename}: {reason(error)}" if error.filename else reason(error)
+    failed = full_disk_in(error)
+    if failed is None and isinstance(error, OSError):
+        failed = error if isinstance(error, PermissionError) or error.errno in (errno.EROFS, errno.EMFILE) else None
+    if failed is not None:
+        return f"{failed.filename}: {reason(failed)}" if failed.filename else reason(failed)
     if isinstance(error, RuntimeError) and LACKS_MEMORY.search(str(error)):
         return f"out of memory ({str(error).splitlines()[0][:160]}); fewer robots (--num-envs) need less"
     return None
@@ -150,3 +195,135 @@ def _say(text: str) -> None:
     except ConfigError:  # the number of the process is itself wrong, which is the error
         rank = ""
     print(f"{rank}error: {text}", file=sys.stderr, flush=True)
+
+
+# ---- lost output -----------------------------------------------------------------------------------------------------
+
+
+class Output:
+    """A text stream that discards text once it can't be written any more."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        """Wrap `stream`, which is None in a process that was started without one."""
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
+        self.lost: str | None = None
+        """Reason why nothing more can be written; None while writing works."""
+        self._when_lost: list[Callable[[], object]] = []
+
+    def write(self, text: str) -> int:
+        """Write a text, or discard it if it can't be written; return the number of characters."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        if self.lost is None:
+            with self._watched():
+                self._stream.flush()
+
+    def when_lost(self, do: Callable[[], object]) -> None:
+        """Call `do` as soon as nothing can be written any more; at once, if that is already so."""
+        if self.lost is not None:
+            do()
+        self._when_lost.append(do)
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
+        except UnicodeError:  # the terminal's encoding lacks a character
+            raise
+        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+            self.lost = _why(error)
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # text in Python's buffer must not fail at exit
+                with suppress(OSError, ValueError):
+                    nowhere = os.open(os.devnull, os.O_WRONLY)
+                    os.dup2(nowhere, self._stream.fileno())
+                    os.close(nowhere)
+            for do in self._when_lost:
+                do()
+
+    def __getattr__(self, name: str) -> Any:
+        """Return any other attribute of the text stream."""
+        return getattr(self._stream, name)
+
+
+def _why(error: OSError | ValueError) -> str:
+    if isinstance(error, ValueError) or error.errno in (errno.EPIPE, errno.EBADF, errno.EIO):
+        return "the output was closed"
+    return f"the output can't be written: {DISK_FULL if error.errno == errno.ENOSPC else reason(error)}"
+
+
+def when_output_is_lost(do: Callable[[], object]) -> None:
+    """Call `do` once nothing can be written to standard output any more. Outside of a command it is never called."""
+    if isinstance(sys.stdout, Output):
+        sys.stdout.when_lost(do)
+
+
+@contextmanager
+def forgiving_output() -> Iterator[Output]:
+    """Make losses of standard output and standard error of this process silent; yield the wrapped standard output."""
+    streams = sys.stdout, sys.stderr
+    output = Output(sys.stdout)
+    sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
+    try:
+        yield output
+    finally:
+        output.flush()
+        sys.stderr.flush()
+        sys.stdout, sys.stderr = streams
+
+
+# ---- signals ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
+    """Call `stop` at the first signal, which ends the training after the iteration; raise KeyboardInterrupt at the second.
+    Yield a list that collects the signals. The earlier handlers are restored afterwards.
+
+    With several processes, all stop as soon as one is told to. There a second signal has no effect: torchrun passes on the
+    signals that the terminal has already sent, and kills processes that take more than half a minute. Outside the main thread
+    Python can't handle signals, so none are handled.
+    """
+    received: list[int] = []
+    ranks = Ranks.now()
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        if len(received) > 1 and not ranks.several:
+            raise KeyboardInterrupt
+        if len(received) == 1 and ranks.first:
+            once_more = "" if ranks.several else "; once more to stop at once"
+            with suppress(RuntimeError):  # the signal came during another write to the same stream
+                print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
+        stop()
+
+    # A signal that nohup ignores stays ignored: the training is to outlive its terminal.
+    numbers = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN] if in_main_thread() else []
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield received
+    finally:
+        for number, old in before.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)
+
+
+@contextmanager
+def quiet_writers() -> Iterator[None]:
+    """Keep writer threads from printing a traceback when they cannot write a file; TensorBoard's writer raises the same error
+    again in the caller.
+    """
+    before = threading.excepthook
+
+    def hook(args: threading.ExceptHookArgs) -> None:
+        if not isinstance(args.exc_value, OSError):
+            before(args)
+
+    threading.excepthook = hook
+    try:
+        yield
+    finally:
+        threading.excepthook = before

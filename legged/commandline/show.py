@@ -1,7 +1,7 @@
 """Summary of a configuration for `--show`: terms with their columns, actions and joints."""
 
 import inspect
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
@@ -32,8 +32,8 @@ def summary(cfg: TaskConfig) -> list[str]:
     if torch.get_num_threads() > 1:
         torch.set_num_threads(1)
     task = make_task(override(cfg, ALONE), "cpu", graph=False)
-    lines = [line for part in PARTS for line in part(task)]
-    return [f"# {line}".rstrip() for line in lines]
+    parts = (_robot, _observations, _rewards, _terminations, _randomisation, _actions, _joints)
+    return [f"# {line}".rstrip() for part in parts for line in part(task)]
 
 
 def _says(task: BaseTask, method: str) -> str:
@@ -42,17 +42,16 @@ def _says(task: BaseTask, method: str) -> str:
     return text.partition(". ")[0].rstrip(".")
 
 
-def _table(title: str, rows: Sequence[tuple[str, ...]]) -> Iterator[str]:
+def _table(title: str, *rows: tuple[str, ...]) -> Iterator[str]:
     """Yield a title and rows in columns; the last column has any width."""
-    yield ""
-    yield title
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)][:-1]
+    yield from ("", title)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    widths[-1] = 0
     for row in rows:
-        yield "  " + "  ".join([cell.ljust(width) for cell, width in zip(row, widths, strict=False)] + [row[-1]])
+        yield "  " + "  ".join(map(str.ljust, row, widths))
 
 
-def _number(value: float) -> str:
-    return f"{value:.6g}"
+_number = "{:.6g}".format
 
 
 def _robot(task: BaseTask) -> Iterator[str]:
@@ -65,11 +64,10 @@ def _robot(task: BaseTask) -> Iterator[str]:
         by = growth(size_of(name), size)
         if set(by.values()) == {1.0}:
             line += "; numbers are written for it"
-            continue
-        factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
-        line += f"; numbers written for {Path(name).name} are rescaled: {factors}"
-    yield ""
-    yield line
+        else:
+            factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
+            line += f"; numbers written for {Path(name).name} are rescaled: {factors}"
+    yield from ("", line)
 
 
 def _observations(task: BaseTask) -> Iterator[str]:
@@ -86,7 +84,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
             columns = f"{term.columns.start}:{term.columns.stop}"
             rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
         steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
-        yield from _table(f"observations '{name}': {width} numbers{steps}; noise before scaling", rows)
+        yield from _table(f"observations '{name}': {width} numbers{steps}; noise before scaling", *rows)
 
 
 def _rewards(task: BaseTask) -> Iterator[str]:
@@ -96,7 +94,7 @@ def _rewards(task: BaseTask) -> Iterator[str]:
     rows += [(name, _number(scales[name]), _says(task, f"_reward_{name}")) for name in task.rewards.names]
     off = [name for name, scale in scales.items() if scale == 0.0]
     clip = "; their sum is clipped at 0" if task.cfg.rewards.only_positive_rewards else ""
-    yield from _table(f"rewards, {times}{clip}{'; off: ' + ', '.join(off) if off else ''}", rows)
+    yield from _table(f"rewards, {times}{clip}{'; off: ' + ', '.join(off) if off else ''}", *rows)
 
 
 def _terminations(task: BaseTask) -> Iterator[str]:
@@ -106,44 +104,37 @@ def _terminations(task: BaseTask) -> Iterator[str]:
         rows += [(name, kind, _says(task, f"_terminate_{name}")) for name in names]
     rows.append(("(time)", "time-out", f"{task.max_episode_length} control steps, {task.cfg.env.episode_length_s:g} s"))
     rows.append(("(numbers)", "failure", "a number of the physics, a reward or an observation is not finite"))
-    yield from _table("terminations", rows)
+    yield from _table("terminations", *rows)
 
 
 def _randomisation(task: BaseTask) -> Iterator[str]:
     """Yield the properties that differ from robot to robot, including those with legged_gym's names, and the disturbances."""
+    rand, draws = task.cfg.domain_rand, task.randomization.draws
+    drawn = {name: (draw, task.randomization.is_each(name)) for name, draw in draws.items()}
+    pushes: list[tuple[str, str, str]] = []
+    if isinstance(rand, LeggedDomainRandConfig):
+        mass = ("added_base_mass", rand.randomize_base_mass, rand.added_mass_range)
+        for name, on, span in (mass, ("friction", rand.randomize_friction, rand.friction_range)):
+            if on and name not in draws:
+                drawn = {name: (DrawConfig(range=span), False)} | drawn
+        pushes += _pushes(rand)
     rows = []
-    for name, draw in task.randomization.draws.items():
-        drawn_from, distribution, moments = _drawn(draw, FIELDS[name].unit)
-        each = f", for each of {task.field_rows[name]}" if task.randomization.is_each(name) else ""
-        rows.append((name, drawn_from, distribution, moments + each, FIELDS[name].meaning))
-    rand = task.cfg.domain_rand
-    for name, on, span in _of_legged_gym(rand) if isinstance(rand, LeggedDomainRandConfig) else ():
-        if on and name not in task.randomization.draws:
-            rows.insert(0, (name, *_drawn(DrawConfig(range=span), FIELDS[name].unit), FIELDS[name].meaning))
+    for name, (draw, each) in drawn.items():
+        sigma = f", sigma {_number(standard_deviation(draw))}" if draw.distribution == "gaussian" else ""
+        moment = {"start": "once", "reset": "each episode", "interval": f"every {_number(draw.interval_s)} s"}[draw.when]
+        moment += _grown(draw.grow) + (f", for each of {task.field_rows[name]}" if each else "")
+        field = FIELDS[name]
+        rows.append((name, _span(draw.range, field.unit), draw.distribution + sigma, moment, field.meaning))
     if rows:
         header = ("property", "range", "distribution", "drawn", "what it is")
-        yield from _table("randomised; play and evaluation switch it off unless told otherwise", [header, *rows])
-    pushes = list(_pushes(rand)) if isinstance(rand, LeggedDomainRandConfig) else []
+        yield from _table("randomised; play and evaluation switch it off unless told otherwise", header, *rows)
     if pushes:
-        yield from _table("disturbances", [("name", "how much", "when"), *pushes])
-
-
-def _of_legged_gym(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, bool, tuple[float, float]]]:
-    """Yield property, True if it is randomised, and range."""
-    yield "added_base_mass", rand.randomize_base_mass, rand.added_mass_range
-    yield "friction", rand.randomize_friction, rand.friction_range
+        yield from _table("disturbances", ("name", "how much", "when"), *pushes)
 
 
 def _span(span: tuple[float, float], unit: str) -> str:
     """Return a range with its unit."""
     return f"{_number(span[0])} to {_number(span[1])}{'' if unit == '1' else f' {unit}'}"
-
-
-def _drawn(draw: DrawConfig, unit: str) -> tuple[str, str, str]:
-    """Return range, distribution and times of a randomised property, as texts."""
-    sigma = f", sigma {_number(standard_deviation(draw))}" if draw.distribution == "gaussian" else ""
-    moment = {"start": "once", "reset": "each episode", "interval": f"every {_number(draw.interval_s)} s"}[draw.when]
-    return _span(draw.range, unit), draw.distribution + sigma, moment + _grown(draw.grow)
 
 
 def _grown(grow: tuple[float, float]) -> str:
@@ -171,7 +162,7 @@ def _actions(task: BaseTask) -> Iterator[str]:
     acted = list(task.control.acted) if isinstance(task, LeggedRobot) else list(range(task.num_actions))
     for i in range(model.nu):
         rows.append((str(acted.index(i)) if i in acted else "-", model.actuator(i).name or f"({i})", _effect(task, i)))
-    yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", rows)
+    yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", *rows)
 
 
 def _effect(task: BaseTask, i: int) -> str:
@@ -212,14 +203,8 @@ def _joints(task: BaseTask) -> Iterator[str]:
     rows = [("joint", "kind", "qpos", "qvel", "range")]
     for i in range(model.njnt):
         joint = model.joint(i)
-        qpos, qvel = (
-            f"{adr}:{adr + len(now)}"
-            for adr, now in ((int(joint.qposadr[0]), joint.qpos0), (int(joint.dofadr[0]), joint.damping))
-        )
+        places = ((int(joint.qposadr[0]), joint.qpos0), (int(joint.dofadr[0]), joint.damping))
+        qpos, qvel = (f"{first}:{first + len(numbers)}" for first, numbers in places)
         limits = f"{joint.range[0]:.4g} to {joint.range[1]:.4g}" if joint.limited else "-"
         rows.append((joint.name or f"({i})", kinds[int(joint.type[0])], qpos, qvel, limits))
-    yield from _table(f"joints: {model.nq} positions, {model.nv} velocities", rows)
-
-
-PARTS = (_robot, _observations, _rewards, _terminations, _randomisation, _actions, _joints)
-"""Parts of the summary, in this order."""
+    yield from _table(f"joints: {model.nq} positions, {model.nv} velocities", *rows)

@@ -9,7 +9,7 @@ import numpy as np
 from legged.episodes.panels import Panels
 from legged.episodes.ranking import Figures
 from legged.episodes.stored import Episodes
-from legged.evaluation.reports.document import render
+from legged.evaluation.reports import render
 from legged.evaluation.result_file import changes_text
 from legged.process.paths import relative, write_text
 

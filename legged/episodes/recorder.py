@@ -12,7 +12,7 @@ from legged.envs import BaseTask, LeggedRobot
 from legged.envs.final_observation import watch_steps
 from legged.episodes.quantities import FLAGS, quantities_of
 from legged.episodes.stored import Episodes
-from legged.evaluation.overflows import Overflows
+from legged.evaluation.measurement import Overflows
 
 CHUNK_MB = 64.0
 """Size of a chunk of steps on the device [MiB]; a chunk is fetched in one transfer."""

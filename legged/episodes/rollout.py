@@ -15,7 +15,7 @@ from legged.episodes.recorder import StepRecord, record_episodes
 from legged.episodes.stored import Episodes
 from legged.episodes.stored_check import FORMAT
 from legged.errors import ConfigError
-from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.measurement import warn_of_overflows
 from legged.evaluation.result_file import changes_of, device_name
 from legged.physics import engine_name, resolve_physics
 from legged.play.playground import SETTING, Playground

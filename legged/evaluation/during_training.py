@@ -147,9 +147,8 @@ class TrainingEvaluation:
                     task.metrics.flush()
                 self._graph()
             found = self._found(steps - settle)
-            names = list(found)
-            numbers = torch.stack([found[name] for name in names]).tolist()
-        return dict(zip(names, numbers, strict=True))
+            numbers = torch.stack(list(found.values())).tolist()
+        return dict(zip(found, numbers, strict=True))
 
     def _found(self, measured: int) -> dict[str, Tensor]:
         """Return the figures as 0-dimensional tensors, after `measured` steps in which errors were added."""

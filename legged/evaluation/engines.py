@@ -1,29 +1,23 @@
-"""The physics engines in which policies are measured: settings, labels and looks of curves."""
+"""The physics engines in which policies are measured."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, get_args
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, get_args
 
 from legged.config.schema import NewtonSolver
 
 
-@dataclass(frozen=True)
-class Engine:
-    """An engine, or a solver of Newton."""
+class Engine(NamedTuple):
+    """An engine, or a solver of Newton: its name in tables, and the settings that choose it."""
 
     label: str
-    line: str
-    """Line style of its curves, as in matplotlib."""
-    marker: str
     overrides: Sequence[tuple[str, Any]] = ()
-    """Settings that choose it."""
 
 
 ENGINES = {
-    "mujoco_warp": Engine("mujoco-warp", "-", "o", [("sim.physics", "mujoco_warp")]),
-    "mujoco": Engine("C MuJoCo", "--", "s", [("sim.physics", "mujoco")]),
+    "mujoco_warp": Engine("mujoco-warp", [("sim.physics", "mujoco_warp")]),
+    "mujoco": Engine("C MuJoCo", [("sim.physics", "mujoco")]),
     **{
-        f"newton_{name}": Engine(f"Newton, {name}", "-.", "^", [("sim.physics", "newton"), ("sim.solver", name)])
+        f"newton_{name}": Engine(f"Newton, {name}", [("sim.physics", "newton"), ("sim.solver", name)])
         for name in get_args(NewtonSolver)
     },
 }
@@ -32,4 +26,9 @@ ENGINES = {
 
 def engine_of(name: str) -> Engine:
     """Return the engine of that name; an unknown engine is labelled by its name."""
-    return ENGINES.get(name, Engine(name, ":", "x"))
+    return ENGINES.get(name, Engine(name))
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names of engines in the order of ENGINES, others last."""
+    return sorted(names, key=lambda name: [*ENGINES, name].index(name))

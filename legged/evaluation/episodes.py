@@ -1,70 +1,143 @@
-"""Evaluation of tasks without commands: full episodes are measured, printed and written."""
+"""Evaluation of tasks without commands by full episodes, in an engine of this package or in Gymnasium's environment."""
 
+import io
+import json
 import time
-from collections.abc import Sequence
+from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rich.console import Console
 
-from legged.config import override
-from legged.evaluation.overflows import warn_of_overflows
-from legged.evaluation.result_file import changes_of, device_name, file_name, write_result
-from legged.physics import engine_name
-from legged.policies.episodes import episodes_table, for_episodes, measure_episodes
-from legged.policies.restore import TrainedPolicy, restore
+from legged.errors import ConfigError, RunError
+from legged.evaluation.measurement import Setting, warn_of_overflows
+from legged.evaluation.result_file import file_name, write_result
+from legged.policies.episodes import episodes_table, for_episodes, measure_episodes, spread_of
+from legged.policies.export import EXPORTED, export
+from legged.policies.restore import restore
 from legged.process.paths import relative
+from legged.registry import task_class
 
 MOST_EPISODES = 2**16
 """Most episodes at once."""
+GYMNASIUM = "gymnasium"
+"""Name of Gymnasium in files and tables, like that of an engine."""
+REWARD = "reward_"
+"""Prefix of the names of reward parts that Gymnasium returns with each step."""
 
 
-def evaluate_episodes(
-    policy: TrainedPolicy,
-    episodes: int,
-    asked: list[tuple[str, Any]],
-    device: torch.device,
-    graph: bool,
-    folder: Path,
-    where: str = "sim.physics",
-) -> int:
+def evaluate_episodes(setting: Setting, episodes: int) -> int:
     """Run `episodes` robots through their first full episode, without noise and randomisation; print a table and write
-    evaluation_<physics>.json into `folder`. Return the exit code. `where` names the setting of the engine in errors.
-    """
-    start = time.perf_counter()
-    calm, changes = for_episodes(policy, episodes)
-    engine = engine_name(override(policy.cfg, asked).sim, device, where)
-    task, act = restore(calm, [*changes, *asked], device, graph)
-    measured = measure_episodes(task, act)
-    result = {
-        **header(policy, engine, device_name(device), asked),
-        "wall_s": time.perf_counter() - start,
-        "episodes": measured,
-    }
-    code = report(result, folder)
-    warn_of_overflows("episodes", measured["contact_overflows"])
-    return code
-
-
-def header(policy: TrainedPolicy, engine: str, device: str, asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the fields that every result has; `asked` are overrides, of which the result names those that change the
-    conditions.
-    """
-    what = {"task": policy.cfg.task, "checkpoint": policy.checkpoint.name, "physics": engine, "device": device}
-    changes = changes_of(asked)
-    return {**what, "changes": changes} if changes else what
-
-
-def report(result: dict[str, Any], folder: Path) -> int:
-    """Print the table of a result, then write its file; return the exit code.
+    evaluation_<physics>.json. Return the exit code.
 
     Raises:
         RunError: the file can't be written.
     """
+    start = time.perf_counter()
+    calm, changes = for_episodes(setting.policy, episodes)
+    head = {**setting.head, **setting.changes}
+    task, act = restore(calm, [*changes, *setting.asked], setting.device, setting.graph)
+    measured = measure_episodes(task, act)
+    _report({**head, "wall_s": time.perf_counter() - start, "episodes": measured}, setting.folder)
+    warn_of_overflows("episodes", measured["contact_overflows"])
+    return 0
+
+
+def environment_of(task: str) -> str:
+    """Return the name of a task's environment in Gymnasium (`GYMNASIUM_ID` of its class).
+
+    Raises:
+        ConfigError: the task has no environment in Gymnasium.
+    """
+    found = getattr(task_class(task), "GYMNASIUM_ID", None)
+    if not isinstance(found, str):
+        raise ConfigError(f"POLICY: '{task}' is not a task of Gymnasium: its class {task_class(task).__name__} names none")
+    return found
+
+
+def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
+    """Export the policy into the folder of the result, run the exported TorchScript in Gymnasium's environment for `episodes`
+    episodes with the seeds 0, 1, ..., print a table and write evaluation_gymnasium.json. Return the exit code.
+
+    Raises:
+        ConfigError: Gymnasium has no such environment, or one with other observations or actions.
+        RunError: Gymnasium fails, or a file can't be written.
+    """
+    start = time.perf_counter()
+    setting = replace(setting, device=torch.device("cpu"))
+    name, exported = environment_of(setting.policy.cfg.task), setting.folder / EXPORTED
+    calm, changes = for_episodes(setting.policy, 1)
+    task, act = restore(calm, [*changes, *setting.asked], setting.device, graph=False)
+    export(task, act.network, exported, trained=setting.policy.cfg)
+    measured = run_exported(exported, name, episodes)
+    head = {**setting.head, "physics": GYMNASIUM, **setting.changes, "environment": name}
+    _report({**head, "wall_s": time.perf_counter() - start, "episodes": measured}, setting.folder)
+    return 0
+
+
+def _report(result: dict[str, Any], folder: Path) -> None:
+    """Print the table of a result, then write its file."""
     title = f"{result['task']} ({result['checkpoint']}) in {result.get('environment', result['physics'])}"
     Console(width=110).print(episodes_table(result["episodes"], title))
     path = folder / file_name(result["physics"])
     write_result(path, result)
     print(f"written: {relative(path)}")
-    return 0
+
+
+@torch.inference_mode()
+def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
+    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium. Return the form of `measure_episodes`,
+    with Gymnasium's returns and the reward parts that it names as terms.
+
+    Raises:
+        ConfigError: there is no such environment, or it has other observations or actions.
+    """
+    import gymnasium
+
+    script = torch.jit.load(io.BytesIO((exported / "policy.pt").read_bytes()))
+    described = json.loads((exported / "policy.json").read_text(encoding="utf-8"))
+    middle, reach = (np.array(described[f"control_{part}"]) for part in ("middle", "reach"))
+    clip, reach_seen = described["action_clip"], described["observation_clip"]
+    scale = np.concatenate([np.broadcast_to(term["scale"], term["size"]) for term in described["observation"]])
+    history = max(group["history"] for group in described["observation_groups"])
+    try:
+        environment = gymnasium.make(name)
+    except gymnasium.error.Error as error:
+        raise ConfigError(f"evaluate gymnasium: Gymnasium {gymnasium.__version__} has no {name}: {error}") from error
+    shapes = environment.observation_space.shape, environment.action_space.shape
+    own = scale.shape, middle.shape
+    if shapes != own:
+        raise ConfigError(f"evaluate gymnasium: {name} has observations and actions of shapes {shapes}, the policy of {own}")
+    if history != 1:
+        raise RunError(f"evaluate gymnasium: the policy wants the last {history} observations, {name} gives one")
+    returns, lengths, failures = [], [], 0
+    terms: dict[str, float] = defaultdict(float)
+    low, high = environment.action_space.low, environment.action_space.high  # type: ignore[attr-defined]
+    for seed in range(episodes):
+        observation, _ = environment.reset(seed=seed)
+        script.reset()
+        total, length, over = 0.0, 0, False
+        while not over:
+            seen = np.clip(scale * observation, -reach_seen, reach_seen)
+            action = script(torch.as_tensor(seen, dtype=torch.float32)[None])[0].numpy()
+            control = middle + reach * np.clip(action, -clip, clip)
+            observation, reward, failed, out_of_time, info = environment.step(np.clip(control, low, high).astype(np.float32))
+            total, length, over = total + float(reward), length + 1, failed or out_of_time
+            for key, value in info.items():
+                if key.startswith(REWARD):
+                    terms[key.removeprefix(REWARD)] += float(value) / episodes
+        returns.append(total)
+        lengths.append(float(length))
+        failures += int(failed)
+    environment.close()
+    return {
+        "count": episodes,
+        "return": spread_of(returns),
+        "terms": dict(terms),
+        "length": spread_of(lengths),
+        "failures": failures / episodes,
+        "metrics": {},
+    }

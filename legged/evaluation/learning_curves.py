@@ -1,7 +1,7 @@
-"""The TensorBoard files of runs: read, labelled and averaged."""
+"""The TensorBoard files of runs: read, labelled, averaged, and drawn as charts of one run or of several."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,46 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged.config.dotted import value_at
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError
+from legged.evaluation.reports.charts import Chart, Line, curves, stacked
+from legged.figures import COLORS
 from legged.learning.run_folder import CONFIG_FILE
 
 SAME_TIME = 0.05
 """Share by which the iterations of runs may differ in time for the runs to have one time axis."""
-Scalars = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Tag -> (iterations, values)."""
+MOST_PARTS = len(COLORS) - 1
+"""Reward parts with their own colour; the smaller ones are summed."""
+EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
+"""Beginnings of tags; `WATCHED` begins those of evaluations during training."""
+SINGLE = {
+    "Metrics/lin_vel_rmse": ("velocity error [m/s]", 1.0),
+    "Metrics/ang_vel_rmse": ("yaw rate error [rad/s]", 1.0),
+    "Metrics/falls": ("episodes that end in a fall [%]", 100.0),
+}
+"""Tag -> title and factor of a chart."""
+CURRICULUM = {
+    "Metrics/command_vx": ("largest commanded vx [m/s]", 1.0),
+    "Metrics/command_vy": ("largest commanded vy [m/s]", 1.0),
+    "Metrics/command_yaw": ("largest commanded yaw rate [rad/s]", 1.0),
+}
+"""The same for the ranges of a curriculum of commands."""
+LEARNER = {
+    "Policy/mean_std": ("standard deviation of actions (noise)", 1.0),
+    "Loss/value": ("loss of the value function", 1.0),
+    "Loss/behavior": ("behaviour loss: student's actions against its teacher's", 1.0),
+}
+NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
+OF_EVALUATION = {
+    "lin_vel_rmse": ("velocity RMSE [m/s]", 1.0),
+    "ang_vel_rmse": ("yaw rate RMSE [rad/s]", 1.0),
+    "falls": ("robots that fell [%]", 100.0),
+    "return": ("return of an episode", 1.0),
+    "episode_length": ("length of an episode [control steps]", 1.0),
+}
+"""Titles and factors of figures of evaluations; other figures are metrics of the task."""
+Curve = tuple[np.ndarray, np.ndarray]
+"""Iterations and values."""
+Scalars = dict[str, Curve]
+"""Tag -> curve."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +65,10 @@ class Log:
         """Length of a control step [s]; None if the configuration lacks it."""
         dt, decimation = value_at(self.config, "sim.dt"), value_at(self.config, "control.decimation")
         return dt * decimation if isinstance(dt, int | float) and isinstance(decimation, int) else None
+
+
+Named = Sequence[tuple[str, Log]]
+"""Runs with their labels."""
 
 
 def read_scalars(run: Path) -> Scalars:
@@ -66,16 +104,12 @@ def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[s
     """Return a label for each run: task, run name and seed. Without a configuration the label is the folder's name; where two
     labels would be equal, the folder's name is added.
     """
-    found = []
-    for folder, config in zip(folders, configs, strict=True):
-        name, seed = value_at(config, "train.runner.run_name"), value_at(config, "env.seed")
-        parts = [str(config["task"])] if config.get("task") else []
-        parts += [str(name)] if name else []
-        parts += [f"seed {seed}"] if seed is not None else []
-        found.append(", ".join(parts) if config.get("task") else folder.resolve().name)
-    twice = {label for label in found if found.count(label) > 1}
-    names = [folder.resolve().name for folder in folders]
-    named = [f"{text} ({name})" if text in twice else text for text, name in zip(found, names, strict=True)]
+    found, names = [], [folder.resolve().name for folder in folders]
+    for folder, config in zip(names, configs, strict=True):
+        task, name, seed = (value_at(config, path) for path in ("task", "train.runner.run_name", "env.seed"))
+        parts = [str(task), *([str(name)] if name else []), *([f"seed {seed}"] if seed is not None else [])]
+        found.append(", ".join(parts) if task else folder)
+    named = [f"{text} ({name})" if found.count(text) > 1 else text for text, name in zip(found, names, strict=True)]
     return [f"{text} [{i}]" if named.count(text) > 1 else text for i, text in enumerate(named, start=1)]
 
 
@@ -99,18 +133,152 @@ def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
     return np.where(counts > 0.0, sums / np.maximum(counts, 1.0), np.nan)
 
 
-def mean_of(runs: list[Scalars], tag: str) -> tuple[np.ndarray, np.ndarray]:
+def common(curves_of: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the iterations that all curves have, and the values of the curves at them, (curves, iterations)."""
+    found = [dict(zip(*curve, strict=True)) for curve in curves_of]
+    steps = sorted(set.intersection(*map(set, found))) if found else []
+    return np.array(steps), np.array([[values[step] for step in steps] for values in found]).reshape(len(found), len(steps))
+
+
+def mean_of(runs: list[Scalars], tag: str) -> Curve:
     """Return the iterations, counted from 1, that all runs with this tag have, and the mean over the runs."""
-    found = [dict(zip(*run[tag], strict=True)) for run in runs if tag in run]
-    steps = sorted(set.intersection(*(set(values) for values in found))) if found else []
-    return np.array(steps) + 1, np.array([np.mean([values[step] for values in found]) for step in steps])
+    steps, values = common([run[tag] for run in runs if tag in run])
+    return steps + 1, values.mean(axis=0) if len(steps) else steps
+
+
+def times_of(scalars: Scalars) -> Curve:
+    """Return the time of each iteration of the training loop [s]; an empty curve if times were not logged."""
+    parts = [scalars[tag] for tag in ("Perf/collection_time", "Perf/learning_time") if tag in scalars]
+    steps, seconds = common(parts if len(parts) == 2 else [])
+    return steps, seconds.sum(axis=0)
 
 
 def common_time(runs: Collection[Scalars]) -> float | None:
     """Return the mean time of an iteration [s] of the first run that has logged times. Return None if no run has, or if times
     of runs differ by more than `SAME_TIME`.
     """
-    parts = ("Perf/collection_time", "Perf/learning_time")
-    found = [sum(float(np.mean(scalars[part][1])) for part in parts) for scalars in runs if set(parts) <= scalars.keys()]
+    found = [float(seconds.mean()) for _, seconds in map(times_of, runs) if seconds.size]
     alike = bool(found) and min(found) > 0.0 and max(found) <= (1.0 + SAME_TIME) * min(found)
     return found[0] if alike else None
+
+
+# ---- charts ----------------------------------------------------------------------------------------------------------
+
+
+def curves_of_run(log: Log) -> list[str]:
+    """Return the drawings of one run."""
+    run, parts = [("", log)], _parts(log.scalars)
+    drawings = [curves(chart) for chart in (*outcomes(run), *_learner(run), *levels([log]))]
+    return [*drawings[:1], *([parts] if parts else []), *drawings[1:]]
+
+
+def curves_of_runs(runs: Named) -> list[str]:
+    """Return the drawings of several runs laid over each other."""
+    return [curves(chart) for chart in (*outcomes(runs), *_learner(runs), *_one("Terrain/level", "mean terrain level", runs))]
+
+
+def outcomes(runs: Named) -> list[Chart]:
+    """Return charts of what robots do: returns, errors, falls and metrics of the task."""
+    steps = {log.dt for _, log in runs}
+    dt = next(iter(steps)) if len(steps) == 1 else None
+    others = [tag for tag in _tags(runs, "Metrics/") if tag not in (*NOT_OF_THE_TASK, *SINGLE, *CURRICULUM)]
+    return [
+        *_returns(runs),
+        *_several(SINGLE, runs),
+        *_one(LENGTH, f"length of an episode [{'control steps' if dt is None else 's'}]", runs, dt or 1.0),
+        *_several({tag: (_title(tag), 1.0) for tag in others}, runs),
+    ]
+
+
+def _learner(runs: Named) -> list[Chart]:
+    """Return charts of the curriculum of commands, of evaluations during training and of the optimiser."""
+    watched = {tag: OF_EVALUATION.get(tag.removeprefix(WATCHED), (_title(tag), 1.0)) for tag in _tags(runs, WATCHED)}
+    evaluated = {tag: (f"evaluated: {title}", factor) for tag, (title, factor) in watched.items()}
+    wanted = {value_at(log.config, "train.algorithm.desired_kl") for _, log in runs} - {None}
+    level = ("desired_kl", float(wanted.pop())) if len(wanted) == 1 else None
+    return [
+        *_several(CURRICULUM, runs),
+        *_several(evaluated, runs, exact=True, markers=True),
+        *_one("Loss/learning_rate", "learning rate", runs, exact=True, log=True),
+        *_several(LEARNER, runs),
+        *_one("Loss/kl", "divergence (KL) within an update [nat]", runs, level=level),
+    ]
+
+
+def _tags(runs: Named, beginning: str) -> list[str]:
+    return list(dict.fromkeys(tag for _, log in runs for tag in log.scalars if tag.startswith(beginning)))
+
+
+def _title(tag: str) -> str:
+    return tag.partition("/")[2].replace("_", " ")
+
+
+def _several(quantities: dict[str, tuple[str, float]], runs: Named, **how: Any) -> list[Chart]:
+    """Return the charts of quantities, given as tag -> title and factor."""
+    return [chart for tag, (title, factor) in quantities.items() for chart in _one(tag, title, runs, factor, **how)]
+
+
+def _one(
+    tag: str, title: str, runs: Named, factor: float = 1.0, exact: bool = False, markers: bool = False, **look: Any
+) -> list[Chart]:
+    """Return the chart of one quantity, a line a run, as running means unless `exact`; no chart if no run logged it."""
+    lines = []
+    for i, (label, run) in enumerate(runs):
+        steps, values = run.scalars.get(tag, (np.array([]), np.array([])))
+        if len(steps):
+            y = factor * values if exact else smooth(factor * values)
+            lines.append(Line(label if len(runs) > 1 else "", steps + 1, y, markers=markers, style=i))
+    return [Chart(title, "iteration", lines, **look)] if lines else []
+
+
+def _returns(runs: Named) -> list[Chart]:
+    """Return the chart of returns; of one run with the standard deviation over episodes as a band."""
+    charts = _one("Train/mean_reward", "return of an episode", runs)
+    std = runs[0][1].scalars.get("Train/std_reward")
+    if not charts or len(runs) > 1 or std is None:
+        return charts
+    (line,) = charts[0].lines
+    of = dict(zip(std[0] + 1, std[1], strict=True))
+    width = np.nan_to_num(smooth(np.array([of.get(step, np.nan) for step in line.x])))
+    lines = [replace(line, band=(line.y - width, line.y + width))]
+    return [replace(charts[0], title=f"{charts[0].title}, and standard deviation over episodes", lines=lines)]
+
+
+def _parts(scalars: Scalars) -> str:
+    """Return the drawing of the parts of the reward on top of each other; an empty text if none was logged."""
+    names = [tag.removeprefix(EPISODE) for tag in scalars if tag.startswith(EPISODE)]
+    steps, values = common([scalars[EPISODE + name] for name in names])
+    smoothed = [smooth(part) for part in values]
+    known = np.isfinite(smoothed).all(axis=0)
+    if not len(steps) or not known.any():
+        return ""
+    parts = {name: part[known] for name, part in zip(names, smoothed, strict=True)}
+    order = sorted(parts, key=lambda name: -float(np.abs(parts[name]).mean()))
+    shown, rest = {name: parts[name] for name in order[:MOST_PARTS]}, order[MOST_PARTS:]
+    if rest:
+        shown[f"{len(rest)} more"] = np.sum([parts[name] for name in rest], axis=0)
+    chart = Chart("parts of the reward, per second of a full episode", "iteration")
+    return stacked(chart, steps[known] + 1.0, shown)
+
+
+def levels(logs: Sequence[Log]) -> list[Chart]:
+    """Return charts of the terrain levels by type, and of the shares of episodes after which robots move up or down, as means
+    over the runs; no chart without a curriculum of terrain.
+    """
+    scalars = [log.scalars for log in logs]
+    types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]
+    if not types:
+        return []
+    always = {always_promoted(log.config) for log in logs} - {None}
+    level = ("always promoted", always.pop()) if len(always) == 1 else None
+
+    def lines(beginning: str, width: int) -> list[Line]:
+        means = {name: mean_of(scalars, beginning + name) for name in types}
+        each = enumerate(means.items())
+        return [Line(name.replace("_", " "), steps, smooth(values, width), style=i) for i, (name, (steps, values)) in each]
+
+    found = [Chart("mean terrain level by type", "iteration", lines(LEVEL, 1), level=level)]
+    for moved, way in (("promoted", "up"), ("demoted", "down")):
+        shares = lines(f"Terrain/{moved}_", 25)
+        found.append(Chart(f"episodes after which a robot moves {way}", "iteration", shares, percent=True))
+    return [chart for chart in found if any(len(line.x) for line in chart.lines)]

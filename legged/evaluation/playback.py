@@ -1,8 +1,8 @@
 """A policy in C MuJoCo: one robot on a plane, one command after the other."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,22 +21,7 @@ SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
 """Solver settings: pyramidal cones, iterated to convergence."""
 
 
-@dataclass(frozen=True)
-class Played:
-    """The result of a command."""
-
-    command: tuple[float, ...]
-    """vx, vy [m/s], yaw rate [rad/s]."""
-    velocity: tuple[float, ...]
-    """Mean velocity after the first seconds, base frame; NaN after an earlier fall."""
-    height: float
-    """Lowest height of the base after the first seconds [m]."""
-    fell_after: float | None
-    """Time of the fall [s]; None without a fall."""
-
-
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """A robot at the end of a control step."""
 
     time: float
@@ -88,22 +73,22 @@ class Stage:
 
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
-) -> list[Played]:
-    """Play every command for `seconds`, from the default pose with the feet on the ground, at that friction."""
-    stage = Stage(robot, policy, friction)
-    return [_play(stage, np.array(command, dtype=float), seconds) for command in commands]
-
-
-def _play(stage: Stage, command: np.ndarray, seconds: float) -> Played:
-    measured, lowest, fell_after = [], np.inf, None
-    for moment in stage.walk(command, seconds):
-        if moment.time > SETTLING_S:
-            measured.append(moment.velocity)
-            lowest = min(lowest, moment.height)
-        if moment.fallen:
-            fell_after = moment.time
-    velocity = np.mean(measured, axis=0) if measured and fell_after is None else np.full(3, np.nan)
-    return Played(tuple(command.tolist()), tuple(velocity.tolist()), lowest, fell_after)
+) -> list[dict[str, Any]]:
+    """Play every command for `seconds`, from the default pose with the feet on the ground, at that friction. Return for each
+    the `command`, the mean `velocity` after SETTLING_S in the base frame [m/s, m/s, rad/s], the lowest height of the base in
+    that time [m], as `lowest_base`, and the time of the fall [s], as `fell_after`. The time is None without a fall, the
+    velocity and the height are None after one.
+    """
+    stage, rows = Stage(robot, policy, friction), []
+    for command in commands:
+        moments = list(stage.walk(np.array(command, dtype=float), seconds))
+        measured = [moment for moment in moments if moment.time > SETTLING_S] if not moments[-1].fallen else []
+        velocity = np.mean([moment.velocity for moment in measured], axis=0).tolist() if measured else None
+        height = min(moment.height for moment in measured) if measured else None
+        fell_after = moments[-1].time if moments[-1].fallen else None
+        row = {"command": list(map(float, command)), "velocity": velocity, "lowest_base": height, "fell_after": fell_after}
+        rows.append(row)
+    return rows
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:

@@ -19,6 +19,9 @@ SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num
 SECTIONS_THAT_SAY_NOTHING = ("train.", "evaluation.")
 """Sections of such fields; a result holds its grid of commands itself."""
 
+BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
+"""Errors raised by a file that lacks a part of an evaluation."""
+
 ERRORS = {"mean": OrNull(NUMBER), "worst": OrNull(NUMBER)}
 SPREAD = dict.fromkeys(("mean", "std", "min", "max"), NUMBER)
 POINT = {"size": NUMBER, "share": NUMBER}
@@ -51,25 +54,18 @@ def stress_name(engine: str) -> str:
     return f"stress_{engine}.json"
 
 
-def kept_tracking(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the tracking part of the file at `path`, if that is a result with the same `head`; nothing otherwise."""
-    old = _same(path, head)
-    return {name: value for name, value in old.items() if name not in (*head, "wall_s", "success")}
-
-
-def kept_success(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the success part of the file at `path`, if that is a result with the same `head`; nothing otherwise."""
-    return {name: value for name, value in _same(path, head).items() if name == "success"}
-
-
-def _same(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the result at `path` if its head is the same, policy's file included; an empty one otherwise."""
+def kept_parts(path: Path, head: dict[str, Any]) -> dict[str, Any]:
+    """Return the parts of the result at `path` after its head, if its head is the same, policy's file included; an empty
+    mapping otherwise.
+    """
     try:
         old = json.loads(path.read_text(encoding="utf-8"))
         same = isinstance(old, dict) and all(old.get(name) == value for name, value in head.items())
     except (OSError, ValueError, RecursionError):
         return {}
-    return old if same and ("changes" in old) == ("changes" in head) else {}
+    if not same or ("changes" in old) != ("changes" in head):
+        return {}
+    return {name: value for name, value in old.items() if name not in (*head, "wall_s")}
 
 
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
@@ -100,14 +96,9 @@ def check_result(result: Any, where: str) -> None:
         ConfigError: a field is missing or has another type.
     """
     damaged, there = f"{where}: is not the result of an evaluation", result if isinstance(result, dict) else {}
-    if "episodes" in there:
-        check_form(result, {**HEAD, "episodes": EPISODES}, damaged)
-    elif "rough" in there:
-        check_form(result, {**HEAD, **SUCCESS, "rough": TRACKING}, damaged)
-    elif "success" in there and not TRACKING.keys() & there.keys():  # `legged evaluate terrain` alone
-        check_form(result, {**HEAD, **SUCCESS}, damaged)
-    else:
-        check_form(result, {**HEAD, **SUCCESS, **TRACKING}, damaged)
+    alone = "success" in there and not TRACKING.keys() & there.keys()  # from `legged evaluate terrain`
+    tracking: dict[str, Any] = {"rough": TRACKING} if "rough" in there else {} if alone else TRACKING
+    check_form(result, {**HEAD, "episodes": EPISODES} if "episodes" in there else {**HEAD, **SUCCESS, **tracking}, damaged)
 
 
 def device_name(device: torch.device) -> str:
@@ -128,6 +119,15 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
     """Return the part of a result with the errors on the grid of commands."""
     return result.get("rough", result)
+
+
+def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
+    """Return the number of robots of a command grid that fell, and of all; None if the file lacks them."""
+    try:
+        robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
+        return (round(tracking["falls"] * robots), robots) if robots > 0 else None
+    except BROKEN:
+        return None
 
 
 def has_tracking(result: dict[str, Any]) -> bool:

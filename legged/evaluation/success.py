@@ -1,4 +1,4 @@
-"""Success over difficulty: the share of robots that walk out of tiles of each terrain type, over their size.
+"""Success over difficulty, measured, printed and drawn: the share of robots that walk out of tiles of each terrain type.
 
 Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5. Robots start in the middle of a tile and keep their
 heading; commands are 0.75 m/s forward and up to 0.1 m/s sideways. Sizes go beyond those of training. `Scores` defines
@@ -7,24 +7,35 @@ success. These numbers hold for a robot half a metre high: lengths scale with `t
 """
 
 import gc
-from collections.abc import Callable, Mapping, Sequence
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from itertools import chain, product
 from math import sqrt
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from rich.console import Console
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
+from legged.config.dotted import value_at
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
+from legged.evaluation.engines import ENGINES, engine_of, in_order
 from legged.evaluation.intervals import wilson
-from legged.evaluation.overflows import Overflows
+from legged.evaluation.json_forms import ANY, NUMBER, check_form
+from legged.evaluation.measurement import Overflows, Setting
+from legged.evaluation.reports.charts import Chart, Line, draw_charts
+from legged.evaluation.result_file import HEAD, POINT, TYPE, file_name
+from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.evaluation.velocity_grid import read_range, spaced
 from legged.math import uniform, yaw_of
-from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.policies.episodes import Policy
+from legged.policies.restore import restore, undisturbed
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
 
 TILE = 8.0
@@ -70,6 +81,14 @@ TYPES_HELP = (
 
 OPEN, REACHED, FELL, STUCK = range(4)
 """Outcomes of a robot."""
+PANELS = {
+    "stairs": ("stairs_up", "stairs_down"),
+    "narrow stairs": ("narrow_stairs_up", "narrow_stairs_down"),
+    "obstacles": ("obstacles",),
+    "slopes": ("slope_up", "slope_down"),
+    "rough slopes": ("rough_slope_up", "rough_slope_down"),
+}
+"""Types that share a panel; every other type has its own."""
 
 
 class Scores:
@@ -143,10 +162,10 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
 def _named_sizes(name: str, text: str) -> tuple[float, ...]:
     """Return the named sizes of a type, '0.25' or '0.1:0.2:0.05', in its unit."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
-    low, high, step = read_range(flag, text, f"{name}=0.1:0.2:0.05")
+    given = low, high, _ = read_range(flag, text, f"{name}=0.1:0.2:0.05")
     if not SMALLEST <= low <= high <= kind.largest:
         raise ConfigError(f"{flag}: sizes are at least {SMALLEST:g} and at most {kind.largest:g} {kind.unit}, got '{text}'")
-    return tuple(spaced(flag, text, low, high, step, "sizes", MOST_SIZES))
+    return tuple(spaced(flag, text, given, "sizes", MOST_SIZES))
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:
@@ -179,10 +198,7 @@ def place(task: LeggedRobot, robots: int) -> None:
     task.terrain_curriculum.place_at(2 * (index // robots), 2 * (index % robots % variants))
 
 
-@torch.inference_mode()
-def measure_success(
-    task: LeggedRobot, act: Callable[[TensorDict], Tensor], sizes: Sequence[float], robots: int
-) -> tuple[list[dict[str, Any]], int]:
+def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
     """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
     lost contacts in a control step for want of memory.
     """
@@ -192,7 +208,7 @@ def measure_success(
 
 
 @torch.inference_mode()
-def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int) -> tuple[Scores, int]:
+def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
     """Run all robots out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a robot
     lost contacts.
     """
@@ -216,42 +232,33 @@ def run_out(task: LeggedRobot, act: Callable[[TensorDict], Tensor], robots: int)
 
 def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
     """Return the figures of the robots of one size, from their outcomes (n,) and times (n,) [s]."""
-    reached = outcomes == REACHED
-    trials, successes = len(outcomes), int(reached.sum())
-    low, high = wilson(successes, trials)
+    reached, fell = outcomes == REACHED, int((outcomes == FELL).sum())
     return {
         "size": size,
-        "robots": trials,
-        "successes": successes,
-        "share": successes / trials,
-        "low": low,
-        "high": high,
-        "fell": int((outcomes == FELL).sum()),
+        **share_of(reached, fell),
         "stuck": int((outcomes == STUCK).sum()),
-        "mean_time_s": float(times[reached].mean()) if successes else None,
+        "mean_time_s": float(times[reached].mean()) if reached.any() else None,
     }
 
 
-def success_over_difficulty(
-    policy: TrainedPolicy,
-    sizes: Mapping[str, Sequence[float]],
-    robots: int,
-    changes: Sequence[tuple[str, Any]],
-    device: torch.device,
-    graph: bool = True,
-) -> dict[str, Any]:
-    """Measure all `sizes` of each type with `robots` robots each, and print a line a type; `changes` to the configuration
-    come after those of the measurement. Return plain numbers and lists.
-    """
-    assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    cfg: Any = override(policy.cfg, changes)  # another scale asks for other lengths
-    trained, scale = trained_to(policy.cfg), cfg.terrain.scale
+def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
+    """Return the share of successful robots (n,) with its interval, and the number of those that fell."""
+    trials, successes = len(successful), int(successful.sum())
+    low, high = wilson(successes, trials)
+    share = successes / trials
+    return {"robots": trials, "successes": successes, "share": share, "low": low, "high": high, "fell": fell}
+
+
+def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float]], robots: int) -> dict[str, Any]:
+    """Measure all `sizes` of each type with `robots` robots each, and print a line a type. Return plain numbers and lists."""
+    cfg = setting.cfg  # another scale asks for other lengths
+    trained, scale = trained_to(setting.policy.cfg), cfg.terrain.scale  # type: ignore[arg-type]
     found: dict[str, Any] = {}
     lost = 0
     for name, of_type in sizes.items():
         cell = ("terrain.horizontal_scale", cell_for(name, cfg.terrain))
-        own = [*to_run_out(cfg, robots * len(of_type)), *changes, cell]
-        points, overflows = _on_type(policy, name, of_type, robots, own, device, graph)
+        changes = [*to_run_out(cfg, robots * len(of_type)), *setting.asked, cell]
+        points, overflows = _on_type(setting, name, of_type, robots, changes)
         lost += overflows
         kind = TERRAIN_TYPES[name]
         found[name] = {"unit": kind.unit, "what": kind.what, "trained_to": trained.get(name), "points": points}
@@ -273,17 +280,118 @@ def success_over_difficulty(
 
 
 def _on_type(
-    policy: TrainedPolicy,
-    name: str,
-    sizes: Sequence[float],
-    robots: int,
-    changes: Sequence[tuple[str, Any]],
-    device: torch.device,
-    graph: bool,
+    setting: Setting, name: str, sizes: Sequence[float], robots: int, changes: Sequence[tuple[str, Any]]
 ) -> tuple[list[dict[str, Any]], int]:
     """Build the task for one type and measure; after the call nothing refers to the task."""
-    cfg: Any = override(policy.cfg, changes)
+    cfg: Any = override(setting.policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
     gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
-    task, act = restore(policy, changes, device, graph, terrain)
+    task, act = restore(setting.policy, changes, setting.device, setting.graph, terrain)
     return measure_success(task, act, sizes, robots)
+
+
+# ---- table and curves ------------------------------------------------------------------------------------------------
+
+
+def print_success(success: dict[str, Any]) -> None:
+    """Print a table with a line a point; sizes harder than those of training are marked."""
+    rule, beyond = success["definition"], False
+    title = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
+    rows: list[list[str] | None] = []
+    for name, entry in success["types"].items():
+        for i, point in enumerate(entry["points"]):
+            mark = is_beyond(name, point["size"], entry["trained_to"])
+            beyond |= mark
+            time_s = point["mean_time_s"]
+            row = [name if i == 0 else "", f"{point['size']:.3g} {entry['unit']}{' *' if mark else '  '}"]
+            row.append(f"{point['successes']}/{point['robots']} = {100 * point['share']:.0f} %")
+            row += [f"{100 * point['low']:.0f} to {100 * point['high']:.0f} %", str(point["fell"]), str(point["stuck"])]
+            rows.append([*row, "" if time_s is None else f"{time_s:.1f} s"])
+        rows.append(None)
+    heads = ("terrain", "size", "success", "95 % interval", "fell", "stuck", "time to success")
+    Console(width=110).print(screen_table(title, heads, rows))
+    if beyond:
+        print("* harder than in training")
+
+
+def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
+    """Return whether a size is harder than the hardest of training; False if the type was not trained on."""
+    if trained_to is None:
+        return False
+    kind = TERRAIN_TYPES[name]
+    grows = kind.size(1.0) >= kind.size(0.0)  # stepping stones get smaller
+    return size > trained_to + 1e-9 if grows else size < trained_to - 1e-9
+
+
+def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
+    """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
+    checkpoint and were measured with the same fields changed.
+    """
+    found = {result["physics"]: result}
+    drawn = {"types": {ANY: {**TYPE, "points": [{**POINT, "low": NUMBER, "high": NUMBER}]}}, "robots_per_point": NUMBER}
+    for engine in ENGINES.keys() - found:
+        with suppress(OSError, ValueError):  # no file of this package: nothing to show
+            saved = json.loads(path.with_name(file_name(engine)).read_text(encoding="utf-8"))
+            check_form(saved, {**HEAD, "success": drawn}, str(path))
+            same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))
+            if same and saved["physics"] == engine:
+                found[engine] = saved
+    return [found[engine] for engine in in_order(found)]
+
+
+def draw_success(results: list[dict[str, Any]], path: Path) -> None:
+    """Draw success over size with its intervals into a PNG file: a panel a kind of terrain, a line a type and an engine."""
+    rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
+    reached = f"get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
+    draw_charts(success_charts(results), path, f"{results[0]['task']}: robots that {reached}\n{robots} robots a point")
+
+
+def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
+    """Return a chart a kind of terrain: success over size, one line a type and engine."""
+    found = []
+    for title, types in panels_of([name for result in results for name in types_in(result)]).items():
+        lines = []
+        for name, result in product(types, results):
+            if entry := types_in(result).get(name):
+                words = [name.replace("_", " ")] if len(types) > 1 else []
+                words += [engine_of(result["physics"]).label] if len(results) > 1 else []
+                lines.append((entry, success_line(", ".join(words), entry)))
+        found.append(success_chart(title, lines))
+    return found
+
+
+def types_in(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return terrain type -> its measurements; an empty mapping for an evaluation without success."""
+    return value_at(result, "success.types") or {}
+
+
+def success_line(label: str, entry: dict[str, Any]) -> Line:
+    """Return success over size of one terrain type, with its intervals where the file has them."""
+    points = sorted(entry["points"], key=lambda point: point["size"])
+    banded = all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high"))
+    keys = ("size", "share", "low", "high") if banded else ("size", "share")
+    size, share, *band = (np.array([point[key] for point in points], dtype=float) for key in keys)
+    return Line(label, size, share, (band[0], band[1]) if band else None, markers=True)
+
+
+def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
+    """Return the chart of success over the size of a terrain type, from entries of results and their lines. A dotted line
+    marks the hardest size of training; it names its runs where they differ in it.
+    """
+    ends: dict[float, list[str]] = {}
+    for entry, line in lines:
+        if entry["trained_to"] is not None:
+            ends.setdefault(float(entry["trained_to"]), []).append(line.name)
+    label = "hardest of training"
+    walls = tuple((f"{label}: {', '.join(names)}" if len(ends) > 1 else label, end) for end, names in ends.items())
+    what, unit = lines[0][0]["what"], lines[0][0]["unit"]
+    drawn = [line for _, line in lines]
+    return Chart(f"success: {title}", f"{what} [{unit}]", drawn, unit=what, percent=True, walls=walls)
+
+
+def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
+    """Return title -> types of a panel, for the types in `names`."""
+    there = dict.fromkeys(names)
+    shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
+    alone = [name for name in there if name not in chain.from_iterable(PANELS.values())]
+    return {title: types for title, types in shared.items() if types} | {name.replace("_", " "): (name,) for name in alone}

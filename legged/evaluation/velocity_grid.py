@@ -68,10 +68,10 @@ def axis_values(flag: str, text: str) -> list[float]:
     Raises:
         ConfigError: the text has another form.
     """
-    low, high, step = read_range(flag, text, f"{flag}=-1:1:0.5")
+    given = low, high, _ = read_range(flag, text, f"{flag}=-1:1:0.5")
     if max(abs(low), abs(high)) > FASTEST:
         raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g}; commands are in m/s and rad/s")
-    return spaced(flag, text, low, high, step)
+    return spaced(flag, text, given)
 
 
 def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]:
@@ -88,8 +88,7 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
         parts = [*parts, *parts, 1.0]
     if len(parts) != 3 or not np.isfinite(parts).all() or parts[2] <= 0 or parts[1] < parts[0]:
         raise ConfigError(f"{flag}: '{text}' is not of the form low:high:step, e.g. {example}")
-    low, high, step = parts
-    return low, high, step
+    return parts[0], parts[1], parts[2]
 
 
 def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
@@ -100,26 +99,21 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
     """
     check_grid(cfg)
     given = {axis: getattr(cfg.evaluation, axis) for axis in AXES}
-    return {axis: spaced(f"evaluation.{axis}", str(list(values)), *values) for axis, values in given.items()}
+    return {axis: spaced(f"evaluation.{axis}", str(list(values)), values) for axis, values in given.items()}
 
 
 def spaced(
-    where: str,
-    given: str,
-    low: float,
-    high: float,
-    step: float,
-    what: str = "cells of this axis alone",
-    most: int = MOST_VALUES,
+    where: str, text: str, given: Sequence[float], what: str = "cells of this axis alone", most: int = MOST_VALUES
 ) -> list[float]:
-    """Return the values of a range up to `high`; `where`, `given` and `what` are words for errors.
+    """Return the values of a range, `given` as (low, high, step); `where`, `text` and `what` are words for errors.
 
     Raises:
         ConfigError: the range has more than `most` values.
     """
+    low, high, step = given
     count = (high - low) / step + 1.0
     if count > most:
-        raise ConfigError(f"{where}: '{given}' makes {count:,.0f} {what}; at most {most:,} are possible")
+        raise ConfigError(f"{where}: '{text}' makes {count:,.0f} {what}; at most {most:,} are possible")
     whole = int(count + 1e-9)  # 0:0.3:0.1 has three steps, although 0.3 / 0.1 < 3
     return [round(float(value), 6) for value in low + step * np.arange(whole)]
 

@@ -1,41 +1,55 @@
-"""Errors of a policy that follows velocity commands, over a grid of constant ones."""
+"""Errors of a policy that follows velocity commands, over a grid of constant ones: measured, printed and drawn."""
 
+import math
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
-from legged.envs import LeggedRobot
-from legged.evaluation.estimation import EstimateMeter
-from legged.evaluation.overflows import Overflows
+from legged.config.networks import ESTIMATED
+from legged.envs import BaseTask, LeggedRobot
+from legged.envs.marks import unit_of
+from legged.evaluation.measurement import Overflows, Setting
+from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
-from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
+from legged.evaluation.velocity_grid import AXES, Grid, mean_and_worst, number_or_null
+from legged.figures import figure
+from legged.learning.estimator import EstimatingModel, EstimationErrors
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
-from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.policies.episodes import Policy
+from legged.policies.restore import restore, undisturbed
 from legged.terrain import Terrain
 
 GRAVITY = 9.81
 SLOWEST = 0.1
 """Cost of transport is not defined for robots slower than this [m/s]."""
+GAIT = (
+    ("duty factor", "duty_factor", 1.0, "{:.2f}"),
+    ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
+    ("base height", "base_height", 1.0, "{:.3f} m"),
+    ("thigh or shank contact", "thigh_contact", 100.0, "{:.2f} % of steps"),
+)
+"""Label, name in a cell, factor, format; null where every robot fell before it was measured."""
+PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
+"""Heat maps: figure of a cell, axis over which its mean is taken, axis that goes up, title."""
 
 
-def ready_to_track(
-    policy: TrainedPolicy, grid: Grid, asked: list[tuple[str, Any]], device: torch.device, graph: bool
-) -> tuple[LeggedRobot, Actor]:
-    """Build a task of grid.num_envs robots and the policy that acts in it; `asked` holds the overrides of the command line.
-
-    The task stands on a plane or, if it has terrain, on bumpy level ground.
+def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
+    """Build a task of grid.num_envs robots and the policy that acts in it. The task stands on a plane or, if it has terrain,
+    on bumpy level ground.
     """
-    assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-    changes, terrain = place_to_track(policy.cfg, grid, asked)
+    changes, terrain = place_to_track(setting.policy.cfg, grid, setting.asked)  # type: ignore[arg-type]
     if terrain is not None:
         print(f"tracking on rough ground: {grid.size_text}", flush=True)
-    return restore(policy, changes, device, graph, terrain)
+    return restore(setting.policy, changes, setting.device, setting.graph, terrain)
 
 
 def place_to_track(
@@ -53,7 +67,7 @@ def place_to_track(
 
 
 @torch.inference_mode()
-def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], grid: Grid) -> dict[str, Any]:
+def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, Any]:
     """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, one entry a cell in "cells".
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
@@ -61,89 +75,88 @@ def measure_tracking(task: LeggedRobot, act: Callable[[TensorDict], Tensor], gri
     `contact_overflows` counts robots times steps that lost contacts for want of memory; `estimates` holds the errors of a
     policy with an estimator.
     """
-    cells = grid.cells
-    device = torch.device(task.device)
-    commands = torch.tensor(cells, dtype=torch.float32, device=device).repeat_interleave(grid.robots, dim=0)
+    commands = torch.tensor(grid.cells, dtype=torch.float32, device=torch.device(task.device))
+    sums = {name: torch.zeros_like(value) for name, value in _now(task).items()}
+    estimates = EstimateMeter(task, act)
+
+    def add(observations: TensorDict, alive: Tensor) -> None:
+        for name, value in _now(task).items():
+            sums[name] += torch.where(alive if value.dim() == 1 else alive.unsqueeze(1), value, 0.0)
+        estimates.add(observations, alive)
+
+    fell, lost = hold(task, act, commands.repeat_interleave(grid.robots, dim=0), grid.settle_s, grid.hold_s, add)
+    measured_s = (round(grid.hold_s / task.dt) - round(grid.settle_s / task.dt)) * task.dt
+    return {**_summary(task, grid, sums, fell, measured_s), **estimates.found(), "contact_overflows": lost}
+
+
+@torch.inference_mode()
+def hold(
+    task: LeggedRobot, act: Policy, commands: Tensor, settle_s: float, hold_s: float, add: Callable[[Any, Tensor], None]
+) -> tuple[Tensor, int]:
+    """Let robots follow constant commands (N, 3) for `hold_s` [s]; after each step that follows the first `settle_s`, call
+    `add` with the observations and the flags (N,) of the robots that are in their first episode still. Return the flags of
+    those that fell in it, and how often a robot lost contacts.
+    """
     task.reset()
     observations = task.hold_commands(commands)
-    sums, overflows, estimates = _Sums(task), Overflows(), EstimateMeter(task, act)
-    alive = torch.ones(task.num_envs, dtype=torch.bool, device=device)
-    fell = torch.zeros_like(alive)
-    settle, steps = round(grid.settle_s / task.dt), round(grid.hold_s / task.dt)
-    for step in range(steps):
+    alive = torch.ones(task.num_envs, dtype=torch.bool, device=commands.device)
+    fell, overflows = torch.zeros_like(alive), Overflows()
+    for step in range(round(hold_s / task.dt)):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
         fell |= alive & task.terminated_buf
         alive &= ~task.reset_buf
-        if step >= settle:
-            sums.add(task, alive)
-            estimates.add(observations, alive)
-    result = summarize(task, grid, cells, sums, fell.float(), (steps - settle) * task.dt)
-    return {**result, **estimates.found(), "contact_overflows": overflows.total(task)}
+        if step >= round(settle_s / task.dt):
+            add(observations, alive)
+    return fell, overflows.total(task)
 
 
-class _Sums:
-    """Sums per robot over the measured steps of its first episode."""
-
-    NAMES = ("steps", "lin", "ang", "power", "positive_power", "speed", "height", "collision")
-
-    def __init__(self, task: LeggedRobot) -> None:
-        device = torch.device(task.device)
-        self.values = {name: torch.zeros(task.num_envs, device=device) for name in self.NAMES}
-        feet = len(task.robot.feet_indices)
-        self.values |= {name: torch.zeros(task.num_envs, feet, device=device) for name in ("stance", "touch_downs")}
-
-    def add(self, task: LeggedRobot, alive: Tensor) -> None:
-        power = task.torques * task.dof_vel
-        collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
-        now = {
-            "steps": torch.ones_like(alive, dtype=torch.float32),
-            "lin": velocity_error(task.commands, task.base_lin_vel),
-            "ang": yaw_rate_error(task.commands, task.base_ang_vel),
-            "power": power.abs().sum(dim=1),
-            "positive_power": power.clamp(min=0.0).sum(dim=1),
-            "speed": task.base_lin_vel[:, :2].norm(dim=1),
-            "height": task.base_pos[:, 2] - task.height_scan.ground,
-            "collision": collision.any(dim=1).float(),
-            "stance": (task.contact_forces[:, task.feet_indices, 2] > task.contacts.force).float(),
-            "touch_downs": task.contacts.first_contact.float(),
-        }
-        for name, value in now.items():
-            mask = alive if value.dim() == 1 else alive.unsqueeze(1)
-            self.values[name] += torch.where(mask, value, 0.0)
+def _now(task: LeggedRobot) -> dict[str, Tensor]:
+    """Return the quantities of a control step that are summed, each (N,) or (N, feet)."""
+    power = task.torques * task.dof_vel
+    collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
+    return {
+        "steps": torch.ones(task.num_envs, device=power.device),
+        "lin": velocity_error(task.commands, task.base_lin_vel),
+        "ang": yaw_rate_error(task.commands, task.base_ang_vel),
+        "power": power.abs().sum(dim=1),
+        "positive_power": power.clamp(min=0.0).sum(dim=1),
+        "speed": task.base_lin_vel[:, :2].norm(dim=1),
+        "height": task.base_pos[:, 2] - task.height_scan.ground,
+        "collision": collision.any(dim=1).float(),
+        "stance": (task.contact_forces[:, task.feet_indices, 2] > task.contacts.force).float(),
+        "touch_downs": task.contacts.first_contact.float(),
+    }
 
 
-def summarize(
-    task: LeggedRobot, grid: Grid, cells: np.ndarray, sums: _Sums, fell: Tensor, measured_s: float
-) -> dict[str, Any]:
+def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tensor, measured_s: float) -> dict[str, Any]:
     """Return the figures cell by cell, and over the grid; null where no robot was left to be measured."""
+    cells = grid.cells
 
-    def per_cell(name: str) -> np.ndarray:
-        values = sums.values[name].double().cpu().numpy()
-        return values.reshape(len(cells), grid.robots, *values.shape[1:]).sum(axis=1)
+    def per_cell(values: Tensor) -> np.ndarray:
+        return values.double().cpu().numpy().reshape(len(cells), grid.robots, *values.shape[1:])
 
-    counted = per_cell("steps")
+    total = {name: per_cell(values).sum(axis=1) for name, values in sums.items()}
     # A cell in which every robot fell before it was measured has neither errors nor a gait; 0 would look perfect.
-    steps = np.where(counted > 0, counted, np.nan)
-    lin, ang = (np.sqrt(per_cell(name) / steps) for name in ("lin", "ang"))
-    speed = per_cell("speed") / steps
+    steps = np.where(total["steps"] > 0, total["steps"], np.nan)
+    lin, ang = (np.sqrt(total[name] / steps) for name in ("lin", "ang"))
+    speed = total["speed"] / steps
     weight = task.robot.mass * GRAVITY
     moving = speed > SLOWEST
     transport = {
-        name: np.where(moving, per_cell(source) / steps / (weight * np.maximum(speed, SLOWEST)), np.nan)
+        name: np.where(moving, total[source] / steps / (weight * np.maximum(speed, SLOWEST)), np.nan)
         for name, source in (("cost_of_transport", "power"), ("positive_cost_of_transport", "positive_power"))
     }
-    falls = fell.double().cpu().numpy().reshape(len(cells), grid.robots).mean(axis=1)
-    seconds = steps * task.dt
+    falls = per_cell(fell).mean(axis=1)
     columns = {
         "rmse_lin": lin,
         "rmse_ang": ang,
         "falls": falls,
         **transport,
-        "duty_factor": (per_cell("stance") / steps[:, None]).mean(axis=1),
-        "steps_per_s": (per_cell("touch_downs") / seconds[:, None]).mean(axis=1),
-        "base_height": per_cell("height") / steps,
-        "thigh_contact": per_cell("collision") / steps,
+        "duty_factor": (total["stance"] / steps[:, None]).mean(axis=1),
+        "steps_per_s": (total["touch_downs"] / (steps * task.dt)[:, None]).mean(axis=1),
+        "base_height": total["height"] / steps,
+        "thigh_contact": total["collision"] / steps,
         "speed": speed,
     }
     rows = [
@@ -163,3 +176,96 @@ def summarize(
         "gait": rows[reference],
         "cells": rows,
     }
+
+
+class EstimateMeter:
+    """Sums of the squared errors of a policy's estimates; empty for a policy without an estimator."""
+
+    def __init__(self, task: BaseTask, act: Policy) -> None:
+        """Measure the policy `act`, if it is an `Actor` with an estimator."""
+        self._task, self._network = task, getattr(act, "network", None)
+        if isinstance(self._network, EstimatingModel):
+            self._errors = EstimationErrors(task.observation_groups[ESTIMATED])
+            self._squares = torch.zeros(task.num_envs, len(self._errors.names), device=torch.device(task.device))
+            self._counted = torch.zeros(task.num_envs, device=self._squares.device)
+
+    def add(self, observations: TensorDict, counted: Tensor) -> None:
+        """Add the errors of the estimates from `observations` for the robots in `counted` (N,)."""
+        if isinstance(self._network, EstimatingModel):
+            squares = self._errors.squares(self._network.estimate(observations), observations[ESTIMATED])
+            self._squares += torch.where(counted.unsqueeze(1), squares, 0.0)
+            self._counted += counted
+
+    def found(self) -> dict[str, Any]:
+        """Return, as `estimates`, for each term the root mean square error of its numbers over robots and steps, with its
+        unit; null if no step was counted. Return nothing for a policy without an estimator.
+        """
+        if not isinstance(self._network, EstimatingModel):
+            return {}
+        count, found = float(self._counted.double().sum()), {}
+        means = (self._squares.double().sum(dim=0) / max(count, 1.0)).tolist()
+        for name, mean in zip(self._errors.names, means, strict=True):
+            unit = unit_of(getattr(type(self._task), f"_obs_{name}"))
+            found[name] = {"rmse": math.sqrt(mean) if count else None, "unit": unit}
+        return {"estimates": found}
+
+
+def print_tracking(result: dict[str, Any]) -> None:
+    """Print the figures over the grid, and the gait at 0.5 m/s."""
+    lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
+    title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
+    if result["ground"]:
+        title += f", on level ground with bumps of up to {100 * result['bumps']:.2g} cm"
+    rows: list[list[str]] = []
+    cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
+    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang)):
+        if errors["mean"] is None:
+            rows.append([f"{name} RMSE", "none", "every robot fell before it was measured"])
+            continue
+        rows.append([f"{name} RMSE, mean", f"{errors['mean']:.3f} {unit}", cells])
+        rows.append([f"{name} RMSE, worst cell", f"{errors['worst']:.3f} {unit}", _command(errors["worst_cell"])])
+    for name, error in result.get("estimates", {}).items():
+        value = "none" if error["rmse"] is None else f"{error['rmse']:.3f} {error['unit'] or ''}".rstrip()
+        rows.append([f"estimated {name.replace('_', ' ')} RMSE", value, "over all cells"])
+    rows.append(["falls", f"{100 * result['falls']:.2f} %", "of the robots, within the hold"])
+    if result["cost_of_transport"] is not None:
+        rows.append(["cost of transport", f"{result['cost_of_transport']:.2f}", "sum |torque * speed| / (weight * speed)"])
+    at = _command(gait["command"])
+    for label, name, factor, form in GAIT:
+        value = gait[name]
+        rows.append([label, "none" if value is None else form.format(factor * value), at])
+    Console(width=110).print(screen_table(title, ("measure", "value", "where"), rows, left=(0, 2)))
+
+
+def _command(cell: list[float]) -> str:
+    return f"at vx {cell[0]:g}, vy {cell[1]:g} m/s, yaw {cell[2]:g} rad/s"
+
+
+def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
+    """Return the mean of a figure over axis `over` of the command grid, (values of vx, values of the other command); NaN for
+    cells in which every robot fell early.
+    """
+    shape = tuple(len(result["grid"][axis]) for axis in AXES)
+    values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing
+        return np.nanmean(values, axis=over)
+
+
+def draw_tracking(result: dict[str, Any], path: Path) -> None:
+    """Draw heat maps: for each (vx, vy) and each (vx, yaw), the mean over the third command."""
+    grid = result["grid"]
+    with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
+        for axis, (name, over, other, label) in zip(axes[0], PANELS, strict=True):
+            values = grid_means(result, name, over)
+            image = axis.imshow(values.T, origin="lower", aspect="auto", cmap="viridis_r", vmin=0.0)
+            axis.set_xticks(range(len(grid["vx"])), [f"{v:g}" for v in grid["vx"]])
+            axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
+            axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
+            axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
+            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # of nothing, where all robots fell
+            for (i, j), value in np.ndenumerate(values):
+                dark = value > 0.6 * largest
+                axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")
+            drawn.colorbar(image, ax=axis, label=label)
+        drawn.suptitle(f"{result['task']} in {result['physics']}, {result['ground']}falls {100 * result['falls']:.1f} %")

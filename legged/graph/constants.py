@@ -8,9 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-
-class HostReadError(RuntimeError):
-    """Error for code of the step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
+from legged.errors import HostReadError
 
 
 class Constants:

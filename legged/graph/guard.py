@@ -17,8 +17,8 @@ from torch.utils._device import DeviceContext, _device_constructors
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from legged.errors import TermError
-from legged.graph.constants import Constants, HostReadError, holds_tensors, key_of
+from legged.errors import HostReadError, TermError
+from legged.graph.constants import Constants, holds_tensors, key_of
 from legged.graph.python_state import attributes, random_states, shown
 
 __all__ = ["ForbidHostReads", "ForbidReads", "HostReadError", "calling"]

@@ -1,133 +1,138 @@
-"""Mapping of legged_gym's configuration classes to a task."""
+"""Mapping of a fork's live configuration and methods to a task."""
 
-import difflib
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable
 from typing import Any
 
-from legged.config.schema import STATE_TERMS
+from legged.config.checks import build
+from legged.config.origins import Origins
+from legged.config.schema import STATE_TERMS, TerrainConfig
 from legged.envs import LeggedRobot
-from legged.migration.found import Found, Place
-from legged.migration.legged_gym_defaults import LEFT_OUT
-from legged.migration.settings import (
-    ELSEWHERE,
-    OF_HEIGHTS,
-    OF_LEARNING,
-    OF_RECURRENT,
-    OF_TERRAIN,
-    OF_THE_ROBOT,
-    REWARDS,
-    SAME,
-    SAME_REWARDS,
-    SECTIONS_ELSEWHERE,
-    TERRAINS,
-)
-from legged.migration.translation import DEFAULTS, Translation, flat, is_number
+from legged.errors import ConfigError
+from legged.migration import tables
+from legged.migration.legged_gym_defaults import DIGESTS
+from legged.migration.reading import Fork, Found, Method
+from legged.migration.translation import DEFAULTS, Translation, is_number
 from legged.terrain import TERRAIN_TYPES
+from legged.terrain.terrain import check_terrain
 
 LONGEST_HISTORY = 20
 """Largest number of steps of an observation history that is tried."""
-BLIND_TERMS = STATE_TERMS[1:]
-"""Usual observations of a robot that does not measure its velocity."""
+SIGMA = "tracking_sigma"
+OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
+"""Methods of legged_gym that use commands[:, 3], the heading."""
 
 
-def map_settings(environment: type, learner: type | None) -> Translation:
-    """Map the configuration classes of an environment and of its learner."""
-    theirs = flat(environment)
-    learning = {} if learner is None else flat(learner)
-    for section, values in LEFT_OUT.items():
-        named = {path for path in learning if path.startswith(f"{section}.")}
-        if named:  # a section without base class leaves missing settings to rsl_rl
-            place = next(learning[path].place for path in sorted(named))
-            learning |= {
-                f"{section}.{name}": Found(value, Place(f"rsl_rl's default; {place}", 0))
-                for name, value in values.items()
-                if f"{section}.{name}" not in named
-            }
-    result = Translation(theirs | learning)
-    result.take(SAME)
-    _base_mass(result)
-    _terrain(result)
+def map_settings(fork: Fork) -> Translation:
+    """Map the settings and the methods of a fork."""
+    result = Translation(_moved(fork.settings))
+    for theirs, ours in tables.SAME.items():
+        if theirs in tables.ABSENT and theirs not in result.theirs:
+            result.put(ours, tables.ABSENT[theirs], "", "theirs has no such setting")
+    result.take(tables.SAME)
+    if not result.settings.get("domain_rand.randomize_base_mass", False):
+        result.settings.pop("domain_rand.added_mass_range", None)
+    _terrain(result, fork)
     _commands(result)
-    _friction(result)
-    _collisions(result)
-    _rewards(result)
-    _observations(result)
+    _contacts(result)
+    _rewards(result, fork)
+    _observations(result, fork)
     _learning(result)
     _random_model(result)
+    _delay(result)
+    _hooks(result, fork)
     _rest(result)
     return result
 
 
-def _base_mass(result: Translation) -> None:
-    """Remove the range of the base's mass if the mass is not randomised."""
-    drawn = result.settings.get("domain_rand.randomize_base_mass", False)
-    if not drawn:
-        result.settings.pop("domain_rand.added_mass_range", None)
+def _moved(settings: dict[str, Found]) -> dict[str, Found]:
+    """Return the settings by legged_gym's paths."""
+    paths = {}
+    for path in settings:
+        start = next((old for old in tables.MOVED if path == old or (old.endswith(".") and path.startswith(old))), "")
+        paths[path] = tables.MOVED[start] + path.removeprefix(start) if start else path
+    return {paths[path]: found for path, found in settings.items() if paths[path] == path or paths[path] not in settings}
 
 
-def _terrain(result: Translation) -> None:
-    mesh = result.get("terrain.mesh_type", "trimesh")
-    proportions = result.get("terrain.terrain_proportions")
-    result.done |= set(OF_TERRAIN) | set(OF_HEIGHTS)
+def _terrain(result: Translation, fork: Fork) -> None:
+    mesh = result.get("terrain.mesh_type", "plane")
+    shares = result.get("terrain.terrain_proportions")
+    result.done |= set(tables.OF_TERRAIN) | set(tables.OF_HEIGHTS)
     if result.get("terrain.measure_heights", False):
-        result.take(OF_HEIGHTS)
+        result.take(tables.OF_HEIGHTS)
     if mesh in ("plane", "none", None):
         return
     if mesh not in ("trimesh", "heightfield"):
         result.lose("terrain.mesh_type", "terrain.mesh_type here is plane or height_map")
         return
     result.put("terrain.mesh_type", "height_map", "terrain.mesh_type")
-    result.take(OF_TERRAIN)
+    result.take(tables.OF_TERRAIN)
     rows = int(result.number("terrain.num_rows", 10))
     if result.number("terrain.max_init_terrain_level", 5) >= rows > 0:
         result.put("terrain.max_init_terrain_level", rows - 1, "terrain.max_init_terrain_level", "of the rows there are")
-    if isinstance(proportions, dict):
-        given = {name: share for name, share in result.table("terrain.terrain_proportions").items() if share > 0.0}
-        shares = {name: share for name, share in given.items() if name in TERRAIN_TYPES}
-        if len(shares) < len(given):
-            result.lose("terrain.terrain_proportions", f"types here are {', '.join(TERRAIN_TYPES)}")
+    unknown: list[str] = []
+    if isinstance(shares, dict):
+        found = result.table("terrain.terrain_proportions")
     else:
-        shares = _shares(result, result.numbers("terrain.terrain_proportions", []))
-    total = sum(shares.values())
-    if not total:
-        result.put(
-            "terrain.proportions", {"flat": 1.0}, "terrain.terrain_proportions", "none of the file's types exists here"
-        )
-        return
-    comment = "" if abs(total - 1.0) < 1e-6 else f"theirs sum to {total:g}"
-    columns = max(1, int(result.number("terrain.num_cols", 20)))
-    shares, joined = _of_whole_columns({name: share / total for name, share in shares.items()}, columns)
-    if joined:
-        comment = f"{', '.join(joined)} would have less than one of {columns} columns"
-    result.put("terrain.proportions", shares, "terrain.terrain_proportions", comment)
-
-
-def _shares(result: Translation, proportions: list[Any]) -> dict[str, float]:
-    """Return terrain type -> share, from a list in legged_gym's order."""
-    shares: dict[str, float] = {}
-    for share, types in zip(proportions, TERRAINS, strict=False):
-        for name, part in types.items() if share > 0.0 else ():
-            shares[name] = float(share) * part
-    more = [share for share in proportions[len(TERRAINS) :] if share]
-    if more:
+        found = _shares(result.numbers("terrain.terrain_proportions", []), fork.terrains, unknown)
+    kept = {name: share for name, share in found.items() if share > 0.0 and name in TERRAIN_TYPES}
+    unknown += [name for name, share in found.items() if share > 0.0 and name not in kept]
+    _fitting(result, kept, unknown)
+    if unknown:
         result.lose(
-            "terrain.terrain_proportions",
-            f"legged_gym has {len(TERRAINS)} types; later entries have a meaning of the fork's, and are left out",
+            "terrain.terrain_proportions", f"not here or too large: {', '.join(unknown)}; types here are in terrain.md"
         )
+    comment = "none of the file's types is here" if not kept else f"theirs has {', '.join(unknown)} too" if unknown else ""
+    kept = kept or {"flat": 1.0}
+    total = sum(kept.values())
+    kept, joined = _of_whole_columns({name: share / total for name, share in kept.items()}, result)
+    comment = comment or (f"{', '.join(joined)} would have less than one column" if joined else "")
+    result.put("terrain.proportions", kept, "terrain.terrain_proportions", comment)
+
+
+def _shares(proportions: list[float], functions: list[Any] | None, unknown: list[str]) -> dict[str, float]:
+    """Return terrain type -> share of a list, by the functions that the fork calls, or by legged_gym's order."""
+    shares: dict[str, float] = {}
+    for i, share in enumerate(proportions):
+        if functions is None:
+            parts = tables.TERRAINS[i] if i < len(tables.TERRAINS) else {f"entry {i + 1}": 1.0}
+        else:
+            parts = {}
+            for calls in functions[i]:
+                names = tuple(name for name, _ in calls or [[f"entry {i + 1}", 0]]) if calls != [] else ()
+                kinds = tables.TERRAIN_FUNCTIONS.get(names)
+                kind = kinds[(calls[0][1] if calls else 0) + 1] if kinds else ""
+                parts[kind or " + ".join(names)] = parts.get(kind or " + ".join(names), 0.0) + 0.5
+        for name, part in parts.items() if share > 0.0 else ():
+            shares[name] = shares.get(name, 0.0) + float(share) * part
     return shares
 
 
-def _of_whole_columns(shares: dict[str, float], columns: int) -> tuple[dict[str, float], list[str]]:
-    """Return shares rounded to whole columns, at least one each, and the types that have less than one column and are left
-    out.
-    """
-    out: list[str] = []
+def _fitting(result: Translation, shares: dict[str, float], unknown: list[str]) -> None:
+    """Remove the types that do not fit on the file's tiles; if not even level ground fits, take the default sizes."""
+    for name in ["flat", *shares]:
+        sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
+        try:
+            check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
+        except ConfigError as error:
+            if name == "flat":
+                reason = str(error).partition("terrain.")[2]
+                for path in tables.OF_TERRAIN:
+                    if result.settings.pop(path, None) is not None:
+                        result.lose(path, f"the terrain would be refused: {reason}")
+            else:
+                shares.pop(name)
+                unknown.append(name)
+
+
+def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[dict[str, float], list[str]]:
+    """Return shares rounded to whole columns, at least one each, and the types that have less than one and are left out."""
+    columns, out = int(result.settings.get("terrain.num_cols", DEFAULTS["terrain"]["num_cols"])), []
     while len(shares) > 1 and min(shares.values()) * columns < 1.0 - 1e-9:
         name = min(shares, key=lambda key: shares[key])
         share = shares.pop(name)
         twin = name.replace("_up", "_down") if "_up" in name else name.replace("_down", "_up")
-        taker = twin if twin in shares else max(shares, key=lambda key: shares[key])
-        shares[taker] += share
+        shares[twin if twin in shares else max(shares, key=lambda key: shares[key])] += share
         out.append(name)
     rounded = {name: round(share, 4) for name, share in shares.items()}
     largest = max(rounded, key=lambda key: rounded[key])
@@ -138,199 +143,232 @@ def _of_whole_columns(shares: dict[str, float], columns: int) -> tuple[dict[str,
 def _commands(result: Translation) -> None:
     """Map the command curriculum: legged_gym widens vx by 0.5 m/s up to max_curriculum."""
     limit = result.number("commands.max_curriculum", 0.0)
-    speeds = result.numbers("commands.ranges.lin_vel_x", [-1.0, 1.0])
+    speeds = result.numbers("commands.ranges.lin_vel_x", [])
     if result.get("commands.curriculum", False) is not True or len(speeds) != 2:
         return
     low, high = speeds
     if limit <= max(-low, high):
         return
-    result.put("commands.ranges.lin_vel_x", [-limit if low < 0 else low, limit], "commands.max_curriculum")
+    comment = f"theirs grows from {low:g} to {high:g} up to max_curriculum"
+    result.put("commands.ranges.lin_vel_x", [-limit if low < 0 else low, limit], "commands.max_curriculum", comment)
     result.put("commands.curriculum.enabled", True, "commands.curriculum")
-    start = round(max(-low, high) / limit, 3)
+    start = round(max(-low, high) / limit, 4)
     comment = "of the full range, on every axis; legged_gym widens vx alone"
     result.put("commands.curriculum.start", start, "commands.max_curriculum", comment)
 
 
-def _friction(result: Translation) -> None:
-    """Average the robot's friction with the ground's, as PhysX does; MuJoCo takes the robot's."""
+def _contacts(result: Translation) -> None:
+    """Average the robot's friction with the ground's, as PhysX does; MuJoCo takes the robot's. Map the filter of contacts."""
     own = result.numbers("domain_rand.friction_range", [])
     ground = result.number("terrain.static_friction", 1.0)
-    if len(own) != 2:
-        return
-    mean = [round(0.5 * (value + ground), 4) for value in own]
-    comment = f"PhysX averages the robot's {own[0]:g} to {own[1]:g} with the ground's {ground:g}"
-    if result.get("domain_rand.randomize_friction", True):
+    if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
+        mean = [round(0.5 * (value + ground), 4) for value in own]
+        comment = f"PhysX averages the robot's {own[0]:g} to {own[1]:g} with the ground's {ground:g}"
         result.put("domain_rand.friction_range", mean, "domain_rand.friction_range", comment)
-
-
-def _collisions(result: Translation) -> None:
     path = "asset.self_collisions"
-    if result.number(path, 1) == 0:
-        if path in result.theirs and not result.theirs[path].place.file.startswith("legged_gym's"):
-            result.put("sim.self_collisions", True, path, "theirs is a filter, 0 lets through")
-        else:
+    if result.number(path, 1) == 0 and path in result.theirs:
+        if result.theirs[path].place.file.startswith("legged_gym's"):
             result.lose(path, "legged_gym lets a robot touch itself unless told otherwise; sim.self_collisions=true does")
+        else:
+            result.put("sim.self_collisions", True, path, "theirs is a filter, 0 lets through")
 
 
-def _rewards(result: Translation) -> None:
-    known = LeggedRobot.terms("_reward_")
-    prefix = "rewards.scales."
-    scales = {path.removeprefix(prefix): found for path, found in result.theirs.items() if path.startswith(prefix)}
-    for name, found in scales.items():
-        ours = REWARDS.get(name, name)
-        path = f"{prefix}{name}"
-        if found.why_unknown:
-            result.lose(path, found.why_unknown)
-        elif found.value is not None and not is_number(found.value):
+def _rewards(result: Translation, fork: Fork) -> None:
+    """Map the scales of rewards with legged_gym's formula; name the methods of the others, which have no scale here."""
+    known, defaults = LeggedRobot.terms("_reward_"), DEFAULTS["rewards"]["scales"]
+    prefix, mapped = "rewards.scales.", set()
+    sigma: list[Method] = []
+    paste, named = [], 0
+    for path in [path for path in result.theirs if path.startswith(prefix)]:
+        name, found = path.removeprefix(prefix), result.theirs[path]
+        scale = result.get(path)
+        if found.why_unknown or not scale:
+            continue
+        if not is_number(scale):
             result.lose(path, "expected a number")
-        elif ours in known:
-            if found.value or ours in DEFAULTS["rewards"]["scales"]:
-                result.put(f"rewards.scales.{ours}", float(found.value or 0.0), path)
-            if found.value and ours not in SAME_REWARDS:
-                result.lose(
-                    path,
-                    f"is the reward of that name here, whose formula may differ; for yours write a method _reward_{name}",
-                )
-        elif found.value:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-            hint = f"; the nearest is {near[0]}" if near else ""
-            own = f"a method _reward_{name} and rewards.scales.{name}: {found.value}"
-            result.lose(path, f"there is no reward of that name here{hint}; write {own} (docs/migrating.md)")
-        result.done.add(path)
-    for name in DEFAULTS["rewards"]["scales"]:
-        if name not in {REWARDS.get(other, other) for other in scales}:
-            result.put(f"rewards.scales.{name}", 0.0, "", "theirs have none")
+            continue
+        methods = fork.methods.get(f"_reward_{name}", [])
+        own = next((method for method in methods if not method.original), None)
+        # In legged_gym the scale feet_stumble has no method, so it has no effect.
+        ours = "stumble" if name == "feet_stumble" and not fork.methods else name
+        named += 1
+        missing = bool(fork.methods) and not methods
+        if own is not None or missing or f"_reward_{ours}" not in DIGESTS or ours not in known:
+            then = f"rewards.scales.{name}: {scale:g}"
+            if missing:
+                paste.append(f"nothing for {then} ({found.place}): the fork's classes have no _reward_{name}")
+            else:
+                paste.append(f"_reward_{name} ({own.place if own else found.place}), then set {then}")
+            sigma += [own] if own is not None and SIGMA in own.reads else []
+        else:
+            mapped.add(ours)
+            result.put(f"{prefix}{ours}", float(scale), path)
+    for name in set(defaults) - mapped:
+        result.put(f"{prefix}{name}", 0.0, "")
+    path = f"rewards.{SIGMA}"
+    if sigma and path in result.theirs:
+        result.lose(path, f"divides the squared error here; {sigma[0].place} has another formula: set it with that method")
+    else:
+        result.take({path: path})
+    counted = f"{len(mapped)} of {named} scales are mapped, with legged_gym's formulas"
+    if not fork.methods:
+        counted += "; no class with rewards was found near the file, so formulas of the same names are not compared"
+    result.note("rewards", counted + (f"; {len(paste)} wait for the fork's own methods" if paste else ""))
+    result.note("paste", *paste) if paste else None
 
 
-def _observations(result: Translation) -> None:
-    """Infer the observation terms from the number of observations."""
-    joints = int(result.number("env.num_actions", 12))
-    points = len(result.numbers("terrain.measured_points_x", [])) * len(result.numbers("terrain.measured_points_y", []))
-    measured = bool(result.get("terrain.measure_heights", False)) and points > 0
-    number, seen_by_critic = result.get("env.num_observations"), result.get("env.num_privileged_obs")
-    actor = _terms(result, number, joints, points if measured else 0, "env.num_observations")
-    _group(result, "actor", *actor, "env.num_observations")
-    critic = actor
-    if seen_by_critic is not None:
-        critic = _terms(result, seen_by_critic, joints, points if measured else 0, "env.num_privileged_obs")
-    _group(result, "critic", *critic, "env.num_privileged_obs")
+def _observations(result: Translation, fork: Fork) -> None:
+    """Map the observations: by what compute_observations joins or, without a class, by their number."""
+    where = next(iter(fork.methods.get("compute_observations", [])), None)
+    numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
+    history = next((result.get(f"env.{name}") for name in tables.HISTORY if f"env.{name}" in result.theirs), None)
+    one = next((result.get(f"env.{name}") for name in tables.ONE_STEP if f"env.{name}" in result.theirs), None)
+    if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
+        history = numbers[0] // one
+    parts = fork.observations
+    if where is None:
+        joints, points = int(result.number("env.num_actions", 12)), 0
+        if result.get("terrain.measure_heights", False):
+            points = len(result.numbers("terrain.measured_points_x", [])) * len(
+                result.numbers("terrain.measured_points_y", [])
+            )
+        guesses = [_by_number(number, joints, points) for number in numbers]
+        if guesses[0] is None:
+            result.note("observations", f"{numbers[0]} numbers are not those of legged_gym: the groups here are the defaults")
+        else:
+            result.note("observations", "guessed from the number alone, since there is no class near the file")
+        groups = [None if guess is None else guess[0] for guess in guesses]
+        history = history or (guesses[0] or ([], 1))[1]
+    elif parts[0] is None:
+        result.note("observations", f"{where.place} joins them in its own way: the groups here are the defaults")
+        groups = [None, None]
+    else:
+        own: list[str] = []
+        groups = [None if part is None else _terms(part, own) for part in parts]
+        missing = f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where.place})" if own else ""
+        result.note("observations", f"{', '.join(groups[0] or []) or 'none of the terms here'}{missing}")
+    if groups[0]:
+        for group, terms in (("actor", groups[0]), ("critic", groups[1] or groups[0])):
+            result.put(f"observations.groups.{group}.terms", terms, "env.num_observations")
+    if isinstance(history, int) and history > 1:
+        comment = "oldest first; forks may have the newest first"
+        result.put("observations.groups.actor.history", history, "env.num_observations", comment)
 
 
-def _terms(result: Translation, number: Any, joints: int, points: int, theirs: str) -> tuple[list[str], int]:
-    """Return the usual terms with exactly this many numbers, and their number of steps; if no group has it, the largest group
-    that fits.
-    """
-    groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(BLIND_TERMS)}
+def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
+    """Return the terms here of the parts of an observation; add the names of other parts to `own`."""
+    terms = []
+    for names in parts:
+        used = {name for name in names if "scale" not in name}
+        term = next((term for term, its in tables.PARTS.items() if its == used), None)
+        if term is None:
+            first = next((name for name in names if name.startswith("self.")), names[0])
+            own.append(re.sub(r"^self\.|[\[(].*|\.(unsqueeze|view|float|clone)$", "", first))
+        elif term not in terms:
+            terms.append(term)
+    return terms
+
+
+def _by_number(number: Any, joints: int, points: int) -> tuple[list[str], int] | None:
+    """Return the usual terms with exactly this many numbers, and their number of steps."""
+    groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if points:
         groups = {size + points: [*terms, "heights"] for size, terms in groups.items()} | groups
     for history in range(1, LONGEST_HISTORY + 1):
         for size, terms in groups.items():
             if number == history * size:
                 return terms, history
-    if not isinstance(number, int) or theirs not in result.theirs:
-        return list(STATE_TERMS), 1
-    size = max((size for size in groups if size < number), default=min(groups))
-    more = f"{number - size} more are the fork's own" if size < number else "which are more than that"
-    result.lose(
-        theirs,
-        f"{', '.join(groups[size])} are {size} numbers, {more}; write a method _obs_<name> for each, and list the terms in"
-        " observations.groups",
-    )
-    return groups[size], 1
-
-
-def _group(result: Translation, group: str, terms: list[str], history: int, theirs: str) -> None:
-    path = f"observations.groups.{group}"
-    result.put(f"{path}.terms", terms, theirs)
-    result.put(f"{path}.history", history, theirs, "oldest first; forks have the newest first" if history > 1 else "")
+    return None
 
 
 def _learning(result: Translation) -> None:
-    result.take(OF_LEARNING)
+    result.take(tables.OF_LEARNING)
     if result.settings.get("train.runner.experiment_name") == "test":  # legged_gym's default
         del result.settings["train.runner.experiment_name"]
-    kind = result.get("runner.policy_class_name", "ActorCritic")
-    if "Recurrent" in str(kind):
-        result.take(OF_RECURRENT)
+    kind = result.theirs.get("runner.policy_class_name")
+    if kind is not None and "Recurrent" in str(kind.value):
+        result.done.add("runner.policy_class_name")
+        result.take(tables.OF_RECURRENT)
         result.put("train.policy.rnn_type", result.get("policy.rnn_type", "lstm"), "policy.rnn_type")
-    elif kind != "ActorCritic":
-        result.lose("runner.policy_class_name", "networks here are those of train.policy")
-    else:
-        result.done |= set(OF_RECURRENT)
-    for path, usual in (("runner.algorithm_class_name", "PPO"), ("runner_class_name", "OnPolicyRunner")):
-        if result.get(path, usual) != usual:
-            result.lose(path, f"training here is rsl-rl's {usual}")
-
-
-RANDOM_MODEL = (
-    ("link_mass", "link_mass", ("link_mass",)),
-    ("motor_strength", "motor_strength", ("motor_strength",)),
-    ("restitution", "restitution", ("restitution",)),
-    ("com_displacement", "com_displacement", ("base_com_x", "base_com_y", "base_com_z")),
-    ("kp", "kp", ("p_gain",)),
-    ("kd", "kd", ("d_gain",)),
-    ("gains", "stiffness_multiplier", ("p_gain",)),
-    ("gains", "damping_multiplier", ("d_gain",)),
-    ("motor_offset", "motor_offset", ("joint_offset",)),
-)
-"""Randomised properties of forks: randomize_<first> switches on <second>_range; the third is the property here with that
-meaning.
-"""
+    result.done |= set(tables.OF_RECURRENT)
 
 
 def _random_model(result: Translation) -> None:
-    """Map the randomised properties of forks that have the same meaning here; leave out those that are switched off."""
-    prefix = "domain_rand."
-    mapped, waiting = set(), set()
-    for name_of_switch, name, fields in RANDOM_MODEL:
-        switch, path = f"{prefix}randomize_{name_of_switch}", f"{prefix}{name}_range"
-        on, values = result.get(switch), result.numbers(path, [])
-        if on and len(values) == 2:
-            mapped.add(switch)
-            for field_of_model in fields:
-                result.put(f"domain_rand.ranges.{field_of_model}", list(values), path)
-        elif on is not False:
-            waiting |= {switch, path} if on else {path}
-    # Properties that may be switched on and have no meaning here are listed with the rest.
-    result.done -= waiting - mapped - {entry.setting for entry in result.lost}
-    angles = result.get(f"{prefix}initial_joint_pos_range")
-    if result.get(f"{prefix}randomize_initial_joint_pos", False) and angles is not None:
-        result.put("init_state.dof_pos_factor", angles, f"{prefix}initial_joint_pos_range")
-    for path in [path for path in result.theirs if path.startswith(f"{prefix}randomize_")]:
-        if path not in result.done and result.theirs[path].value is False:
-            result.done |= {path, f"{prefix}{path.removeprefix(f'{prefix}randomize_')}_range"}
+    """Map the randomised properties of forks; leave out those that are switched off."""
+    for switch, name, fields in tables.RANDOM_MODEL:
+        path = f"domain_rand.{name}"
+        on, values = result.theirs.get(f"domain_rand.randomize_{switch}"), result.theirs.get(path)
+        if on is None or values is None or on.value is not True:
+            continue
+        pair = result.numbers(path, [])
+        if len(pair) == 2:
+            result.done.add(f"domain_rand.randomize_{switch}")
+            for field in fields:
+                ours = field if "." in field else f"domain_rand.ranges.{field}"
+                result.put(ours, [-pair[1], -pair[0]] if field == tables.OFFSET else pair, path)
+        else:
+            result.done -= {path} - {entry.setting for entry in result.lost}
+    reach = result.theirs.get("domain_rand.rand_com_vec")
+    if reach is not None and result.get("domain_rand.randomize_base_com", False):
+        for axis, value in zip("xyz", result.numbers("domain_rand.rand_com_vec", []), strict=False):
+            result.put(f"domain_rand.ranges.base_com_{axis}", [-value, value], "domain_rand.rand_com_vec")
+    turn = result.theirs.get("env.rand_yaw_range")
+    if turn is not None and result.get("env.randomize_start_yaw", False) and is_number(turn.value):
+        result.put("init_state.yaw", [-turn.value, turn.value], "env.rand_yaw_range")
+    for path, found in result.theirs.items():
+        section, _, name = path.partition(".")
+        if found.value is False and path.startswith(("domain_rand.", "env.randomize_")):
+            off = rf"{section}\.(randomize_)?{re.escape(name.removeprefix('randomize_'))}(_.*)?$"
+            result.done |= {other for other in result.theirs if re.match(off, other)}
+
+
+def _delay(result: Translation) -> None:
+    """Map delays of the motors' targets to physics steps."""
+    rand, steps = "domain_rand.", None
+    times, lag = result.theirs.get(f"{rand}delay_ms_range"), result.theirs.get(f"{rand}lag_timesteps")
+    if times is not None and result.get(f"{rand}randomize_action_delay", False):
+        pair = result.numbers(f"{rand}delay_ms_range", [])
+        steps = [round(ms / 1000 / result.number("sim.dt", 0.005)) for ms in pair]
+    elif lag is not None and result.get(f"{rand}randomize_lag_timesteps", False) and isinstance(lag.value, int):
+        steps = [lag.value] * 2
+        result.done.add(f"{rand}lag_timesteps")
+    elif result.theirs.get(f"{rand}delay") is not None and result.get(f"{rand}delay") is True:
+        steps = [0, int(result.number("control.decimation", 4)) - 1]
+        result.put("control.actuator.delay_varies", True, f"{rand}delay")
+    if steps is not None:
+        result.put("control.actuator.delay", steps, f"{rand}delay", "in physics steps")
+
+
+def _hooks(result: Translation, fork: Fork) -> None:
+    """Name the fork's own methods whose content no setting carries over, and the commands with another meaning."""
+    own = {name: method for name, methods in fork.methods.items() for method in methods if not method.original}
+    hooks = [
+        f"{name} ({own[name].place})" for name in own if not name.startswith("_reward_") and name != "compute_observations"
+    ]
+    if hooks:
+        result.note("methods", f"the fork's own, to be moved by hand (docs/migrating.md): {', '.join(hooks)}")
+    readers = [
+        f"{name} ({method.place})" for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING
+    ]
+    if readers:
+        result.note("commands", f"commands[:, 3] is the heading here, and there are no others; compare {', '.join(readers)}")
 
 
 def _rest(result: Translation) -> None:
     """List the settings of the file that no other function handled."""
-    for path in [path for path in result.theirs if path not in result.done and path not in OF_THE_ROBOT]:
-        if not result.given(path):
+    for path, found in result.theirs.items():
+        if path in result.done or path in tables.OF_THE_ROBOT or not result.given(path):
             continue
-        section = next((why for start, why in SECTIONS_ELSEWHERE.items() if path.startswith(start)), None)
-        reason = ELSEWHERE.get(path, section)
-        found = result.theirs[path]
-        if path.startswith("rewards.") and not found.why_unknown and _is_plain(found.value):
+        reason = next((text for pattern, text in tables.NEAR.items() if re.match(pattern, path, re.IGNORECASE)), "")
+        if path.startswith("rewards.") and not reason and not found.why_unknown and _is_plain(found.value):
             name = path.removeprefix("rewards.").replace(".", "_")
             result.put(f"custom.{name}", found.value, path, f"self.cfg.custom['{name}']; theirs is self.cfg.{path}")
+        elif re.match(tables.MINOR, path):
+            result.minor.append(path)
         else:
-            result.lose(path, reason or found.why_unknown or f"no setting here has that meaning{_near(path)}")
+            result.lose(path, found.why_unknown or reason)
 
 
 def _is_plain(value: Any) -> bool:
-    return isinstance(value, bool | int | float | str) or (
-        isinstance(value, list | tuple) and all(isinstance(item, bool | int | float | str) for item in value)
-    )
-
-
-def _near(path: str) -> str:
-    """Return a hint at the setting with the nearest name."""
-    names = {name.rpartition(".")[2]: name for name in _paths(DEFAULTS)}
-    near = difflib.get_close_matches(path.rpartition(".")[2], names, n=1, cutoff=0.75)
-    return f"; the nearest name is {names[near[0]]}" if near else ""
-
-
-def _paths(data: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    for key, value in data.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _paths(value, f"{prefix}{key}.")
+    flat: Iterable[Any] = value if isinstance(value, list) else [value]
+    return all(isinstance(item, bool | int | float | str) for item in flat)

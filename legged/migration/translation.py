@@ -1,4 +1,4 @@
-"""A task made from a legged_gym configuration: settings, comments on them, and lost settings."""
+"""A task made from a fork's configuration: settings, comments on them, and lost settings."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -11,8 +11,8 @@ from legged.config.loader import nest, to_dict
 from legged.config.origins import Origins
 from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
-from legged.migration.found import Found, Place, members
-from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
+from legged.migration.legged_gym_defaults import DEFAULTS as OF_LEGGED_GYM
+from legged.migration.reading import Found, Place
 
 DEFAULTS = to_dict(LeggedConfig())
 LARGEST_NUMBER = 1e12
@@ -29,21 +29,11 @@ class Lost:
     setting: str
     value: str
     reason: str
+    """Empty if no setting here is near."""
 
     def __str__(self) -> str:
         value = f" = {self.value}" if self.value else ""
-        return f"{self.place}: {self.setting}{value}: {self.reason}"
-
-
-def flat(owner: type, prefix: str = "") -> dict[str, Found]:
-    """Return the settings of a configuration class and of its nested classes, by dotted path."""
-    found: dict[str, Found] = {}
-    for name, value in members(owner):
-        if isinstance(value, Found):
-            found[f"{prefix}{name}"] = value
-        else:
-            found |= flat(value, f"{prefix}{name}.")
-    return found
+        return f"{self.place}: {self.setting}{value}: {self.reason or 'no setting here has that meaning'}"
 
 
 @dataclass
@@ -57,8 +47,12 @@ class Translation:
     comments: dict[str, str] = field(default_factory=dict)
     """Dotted path here -> comment."""
     lost: list[Lost] = field(default_factory=list)
+    minor: list[str] = field(default_factory=list)
+    """Paths of lost settings that change no task."""
     done: set[str] = field(default_factory=set)
     """Dotted paths of the file's settings that were handled."""
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
 
     def get(self, path: str, default: Any = None) -> Any:
         """Return a value of the file; `default` if it is not set or unknown. For settings that are computed from several
@@ -76,7 +70,9 @@ class Translation:
 
     def numbers(self, path: str, default: list[float]) -> list[float]:
         """Return a value of the file that must be a list of numbers."""
-        return list(self._of_kind(path, default, _are_numbers, "a list of numbers"))
+        return list(
+            self._of_kind(path, default, lambda x: isinstance(x, list) and all(map(is_number, x)), "a list of numbers")
+        )
 
     def table(self, path: str) -> dict[str, float]:
         """Return a value of the file that must be a table of names and numbers."""
@@ -92,19 +88,16 @@ class Translation:
 
     def given(self, path: str) -> bool:
         """Return True if the file sets it to another value than legged_gym does."""
-        found = self.theirs.get(path)
-        if found is None:
-            return False
-        known = value_at(ENVIRONMENT | LEARNING, path)
-        return bool(found.why_unknown) or plain(found.value) != plain(known)
+        found = self.theirs[path]
+        return bool(found.why_unknown) or plain(found.value) != plain(value_at(OF_LEGGED_GYM, path))
 
     def lose(self, path: str, reason: str) -> None:
         """Record a setting of the file as lost."""
         self.done.add(path)
         found = self.theirs[path]
-        if any(entry.setting == path and entry.place == found.place and entry.reason == reason for entry in self.lost):
-            return
-        self.lost.append(Lost(found.place, path, "" if found.why_unknown else shown(found.value), reason))
+        entry = Lost(found.place, path, "" if found.why_unknown else shown(found.value), reason)
+        if entry not in self.lost:
+            self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
         """Set `path` here, unless the value is the default; a value that the schema refuses is recorded as lost."""
@@ -135,14 +128,14 @@ class Translation:
             else:
                 self.put(ours, found.value, theirs)
 
+    def note(self, subject: str, *lines: str) -> None:
+        """Add lines about a subject to the report."""
+        self.notes.setdefault(subject, []).extend(lines)
+
 
 def is_number(value: Any) -> bool:
     """Return True if a value is a finite number and not a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST_NUMBER
-
-
-def _are_numbers(value: Any) -> bool:
-    return isinstance(value, list | tuple) and all(map(is_number, value))
 
 
 def _is_table(value: Any) -> bool:

@@ -2,14 +2,12 @@
 
 import argparse
 import re
-import shlex
 import sys
 import textwrap
 from typing import Any, NoReturn
 
 from legged.errors import suggest
 
-LEAST_EXAMPLES = 2
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 """Negative numbers, which look like options. Before Python 3.14 argparse does not know -1e-1."""
 OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
@@ -20,13 +18,7 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command's arguments, whose help ends with examples."""
 
     def __init__(self, prog: str, description: str | None, *examples: str, **options: Any) -> None:
-        """Take the words that call the command, its description, and examples as complete command lines.
-
-        Raises:
-            ValueError: fewer than two examples.
-        """
-        if len(examples) < LEAST_EXAMPLES:
-            raise ValueError(f"{prog}: the help of a command shows at least {LEAST_EXAMPLES} examples, got {len(examples)}")
+        """Take the words that call the command, its description, and at least two examples as complete command lines."""
         self.examples = examples
         """Command lines that this parser can parse."""
         shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
@@ -47,12 +39,6 @@ class CommandParser(argparse.ArgumentParser):
         if unknown:
             message += suggest(unknown[1], [name for name in self._option_string_actions if name.startswith("--")], "options")
         super().error(message)
-
-    def arguments_of(self, example: str) -> list[str]:
-        """Return the arguments of an example, without the command and without a redirection of its output."""
-        words = shlex.split(example)
-        end = next((i for i, word in enumerate(words) if word in (">", "|")), len(words))
-        return words[len(self.prog.split()) : end]
 
 
 class Once(argparse.Action):

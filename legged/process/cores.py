@@ -23,17 +23,13 @@ def quota(root: Path, membership: Path) -> float:
         groups = [line.split(":", 2) for line in membership.read_text().splitlines()]
     except OSError:
         return math.inf
-    smallest = math.inf
+    shares = [math.inf]
     for _, controllers, name in (group for group in groups if len(group) == 3):
-        if controllers not in ("", "cpu", "cpu,cpuacct"):
-            continue
-        top = root / controllers if controllers else root
-        group = top / name.strip("/")
-        for folder in (group, *group.parents):
-            smallest = min(smallest, _share(folder))
-            if folder == top:
-                break
-    return smallest
+        if controllers in ("", "cpu", "cpu,cpuacct"):
+            top = root / controllers if controllers else root
+            group = top / name.strip("/")
+            shares += [_share(folder) for folder in (group, *group.parents) if folder.is_relative_to(top)]
+    return min(shares)
 
 
 def _share(folder: Path) -> float:

@@ -11,6 +11,8 @@ import importlib.metadata
 import importlib.util
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -37,16 +39,11 @@ class DeferredCompiler(ModuleType):
         self.__package__ = NAME
         self._marks: list[tuple[str, Any]] = []
         self._not_disabled: list[Any] = []
-
-    def allow_in_graph(self, function: Any) -> Any:
-        """Record that a function is to be traced as one piece."""
-        return self._mark("allow_in_graph", function)
-
-    def assume_constant_result(self, function: Any) -> Any:
-        """Record that a function returns the same value in all calls."""
-        return self._mark("assume_constant_result", function)
+        self.allow_in_graph = partial(self._mark, "allow_in_graph")
+        self.assume_constant_result = partial(self._mark, "assume_constant_result")
 
     def _mark(self, name: str, function: Any) -> Any:
+        """Record that a function is to be traced as one piece, or that it always returns the same value."""
         if not self.stands:
             return getattr(self.real(), name)(function)
         self._marks.append((name, function))
@@ -90,31 +87,29 @@ class DeferredCompiler(ModuleType):
 
 
 class _Submodules:
-    """Finder of the compiler's submodules, which imports the compiler first, since that imports most of them."""
+    """Finder and loader of the compiler's submodules, which imports the compiler first, since that imports most of them. The
+    loader gives Python the already imported module in place of a second copy.
+    """
 
     def __init__(self, stand_in: DeferredCompiler) -> None:
         self._stand_in = stand_in
+        self._specs: dict[str, ModuleSpec | None] = {}
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
         """Return the spec of a submodule that the compiler's import has just loaded; None for all others."""
         if not self._stand_in.stands or not name.startswith(f"{NAME}."):
             return None
         self._stand_in.real()
-        module = sys.modules.get(name)
-        return None if module is None else importlib.util.spec_from_loader(name, _Imported(module))  # type: ignore[arg-type]
-
-
-class _Imported:
-    """Loader that gives Python an already imported module in place of a second copy."""
-
-    def __init__(self, module: ModuleType) -> None:
-        self._module, self._spec = module, module.__spec__
+        if name not in sys.modules:
+            return None
+        self._specs[name] = sys.modules[name].__spec__
+        return importlib.util.spec_from_loader(name, self)  # type: ignore[arg-type]
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        return self._module
+        return sys.modules[spec.name]
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self._spec
+        module.__spec__ = self._specs[module.__name__]
 
 
 def defer_compiler() -> None:
@@ -122,16 +117,10 @@ def defer_compiler() -> None:
     unknown version.
     """
     torch = importlib.util.find_spec("torch") if "torch" not in sys.modules else None
-    if torch is None or torch.origin is None or NAME in sys.modules or not _version().startswith(KNOWN):
+    if torch is None or torch.origin is None or NAME in sys.modules:
         return
-    stand_in = DeferredCompiler(Path(torch.origin).parent / "_dynamo")
-    sys.modules[NAME] = stand_in
-    sys.meta_path.insert(0, _Submodules(stand_in))  # type: ignore[arg-type]
-
-
-def _version() -> str:
-    """Return the version of the installed torch without importing it; empty if its package does not state one."""
-    try:
-        return importlib.metadata.version("torch")
-    except importlib.metadata.PackageNotFoundError:
-        return ""
+    with suppress(importlib.metadata.PackageNotFoundError):  # a torch that does not state its version
+        if importlib.metadata.version("torch").startswith(KNOWN):
+            stand_in = DeferredCompiler(Path(torch.origin).parent / "_dynamo")
+            sys.modules[NAME] = stand_in
+            sys.meta_path.insert(0, _Submodules(stand_in))  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import os
 import re
 import socket
 import sys
+from contextlib import suppress
 from importlib import import_module
 
 from legged.errors import ConfigError, suggest
@@ -30,34 +31,26 @@ def display_answers() -> bool:
     if sys.platform != "linux":
         return True
     wayland = os.environ.get("WAYLAND_DISPLAY")
-    if wayland:
-        folder = os.environ.get("XDG_RUNTIME_DIR", "")
-        if _connects(socket.AF_UNIX, os.path.join(folder, wayland)):
-            return True
-    return _x_answers(os.environ.get("DISPLAY", ""))
-
-
-def _x_answers(name: str) -> bool:
-    """Return True if an X server listens at a display's name, 'host:number.screen'; no host or 'unix' is this machine."""
-    if name.startswith("/"):  # the path of a socket, as on macOS
-        return _connects(socket.AF_UNIX, name) or _connects(socket.AF_UNIX, name.rpartition(".")[0])
-    match = re.fullmatch(r"(?:[a-z]+/)?(.*):(\d+)(?:\.\d+)?", name)
+    if wayland and _connects(os.path.join(os.environ.get("XDG_RUNTIME_DIR", ""), wayland)):
+        return True
+    # host:number.screen; no host or 'unix' is this machine
+    match = re.fullmatch(r"(?:[a-z]+/)?(.*):(\d+)(?:\.\d+)?", os.environ.get("DISPLAY", ""))
     if match is None:
         return False
     host, number = match[1], int(match[2])
     if host in ("", "unix"):
         path = f"/tmp/.X11-unix/X{number}"
-        return _connects(socket.AF_UNIX, "\0" + path) or _connects(socket.AF_UNIX, path)
-    return number < 2**16 - 6000 and _connects(socket.AF_INET, (host.strip("[]"), 6000 + number))
+        return _connects("\0" + path) or _connects(path)
+    return number < 2**16 - 6000 and _connects((host.strip("[]"), 6000 + number))
 
 
-def _connects(family: socket.AddressFamily, address: str | tuple[str, int]) -> bool:
-    """Return True if a server accepts a connection at the address."""
+def _connects(address: str | tuple[str, int]) -> bool:
+    """Return True if a server accepts a connection at a socket's path, or at host and port."""
     try:
         if isinstance(address, tuple):
             socket.create_connection(address, timeout=ANSWER_S).close()
             return True
-        with socket.socket(family, socket.SOCK_STREAM) as end:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as end:
             end.settimeout(ANSWER_S)
             end.connect(address)
     except (OSError, ValueError):
@@ -72,13 +65,9 @@ def off_screen_library() -> str | None:
     """
     for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
         path = ctypes.util.find_library(library)
-        if path is None:
-            continue
-        try:
-            ctypes.CDLL(path)
-        except OSError:
-            continue
-        return name
+        with suppress(OSError):
+            if path is not None and ctypes.CDLL(path):
+                return name
     return None
 
 
@@ -92,8 +81,7 @@ def choose() -> None:
     global NO_PICTURES
     given = os.environ.get("MUJOCO_GL")
     if given is None:
-        found = off_screen_library() if HEADLESS else None
-        if found:
+        if HEADLESS and (found := off_screen_library()):
             os.environ["MUJOCO_GL"] = found
         return
     value = given.lower().strip()
@@ -106,16 +94,12 @@ def choose() -> None:
     except Exception as error:  # each library fails in its own way
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             return  # a robot's computer, which draws nothing
-        NO_PICTURES = _does_not_work(given, error)
+        works = off_screen_library()
+        instead = f"{works} may" if works and works != value else "no other library for drawing was found"
+        why = " ".join(str(error).split())
+        NO_PICTURES = f"MUJOCO_GL: '{given}' does not work on this machine ({why}); {instead}"
         os.environ["MUJOCO_GL"] = OFF[0]
         print(f"warning: {NO_PICTURES}; going on without pictures", file=sys.stderr, flush=True)
-
-
-def _does_not_work(given: str, error: Exception) -> str:
-    """Return the message that MuJoCo does not draw with the requested library, with the reason and a library that works."""
-    works = off_screen_library()
-    instead = f"{works} may" if works and works != given.lower().strip() else "no other library for drawing was found"
-    return f"MUJOCO_GL: '{given}' does not work on this machine ({' '.join(str(error).split())}); {instead}"
 
 
 HEADLESS = not display_answers()

@@ -71,10 +71,8 @@ class Neighbours:
         self._looked_s = time.monotonic()
         with contextlib.suppress(OSError), (self._folder / TURN).open("rb") as turn:
             if lock_descriptor(turn.fileno(), blocking=False):
-                self.most = max(self.most, sum(map(_is_of_a_training, self._others())))
-
-    def _others(self) -> list[Path]:
-        return [path for path in self._folder.glob(f"*{ENDING}") if path != self._path]
+                others = {*self._folder.glob(f"*{ENDING}")} - {self._path}
+                self.most = max(self.most, sum(map(_is_of_a_training, others)))
 
 
 def _is_of_a_training(path: Path) -> bool:

@@ -5,10 +5,11 @@ atomically and check in advance if they can be written.
 import errno
 import itertools
 import os
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -91,13 +92,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def _remove_abandoned(path: Path) -> None:
     """Remove unfinished files for the same path that killed processes left."""
-    prefix = f".{path.stem}."
+    temporary = re.compile(rf"\.{re.escape(path.stem)}\.\d+-\d+{re.escape(path.suffix)}")
     for other in path.parent.iterdir():
-        if not (other.name.startswith(prefix) and other.suffix == path.suffix):
-            continue
-        middle = other.name.removeprefix(prefix).removesuffix(path.suffix)
         with suppress(OSError):
-            if middle.replace("-", "").isdecimal() and time.time() - other.stat().st_mtime > ABANDONED_S:
+            if temporary.fullmatch(other.name) and time.time() - other.stat().st_mtime > ABANDONED_S:
                 other.unlink()
 
 
@@ -160,20 +158,3 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
             probe.write(bytes(2**16))  # a quota takes effect only here
     except OSError as error:
         raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error
-
-
-def ready_to_write_file(flag: str, path: Path, megabytes: float = 1.0, endings: Sequence[str] = ()) -> None:
-    """Check as `ready_to_write` that the file `path`, the value of `flag`, can be written. If `endings` are given, its name
-    must have one of them.
-
-    Raises:
-        ConfigError: it is a folder, has another ending, or can't exist in that place.
-        RunError: it can't be written there.
-    """
-    if "\0" in path.name or len(os.fsencode(path.name)) > LONGEST_NAME:
-        raise ConfigError(f"{flag}: not a valid file name: {path.name}")
-    if path.is_dir() or not path.name:
-        raise ConfigError(f"{flag}: {path} is a folder; expected a file")
-    if endings and path.suffix not in endings:
-        raise ConfigError(f"{flag}: must end in {' or '.join(endings)}, got '{path.name}'")
-    ready_to_write(path.parent, megabytes)

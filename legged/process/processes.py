@@ -1,12 +1,25 @@
-"""Environment of child processes."""
+"""Child processes: their environment, and a pool that runs them side by side with a limit for each kind of work."""
 
 import os
+import signal
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
+from subprocess import DEVNULL, STDOUT, Popen
 
+from legged.process.paths import make_folder
 from legged.process.startup import STAGES_FILE
 
 INSTALLED = ("site-packages", "dist-packages")
 """Names of folders with installed packages."""
+POLL_S = 0.05
+PATIENCE_S = 10.0
+"""Time that a process has to end after a signal [s]."""
+BUILT = "step captured"
+"""Last stage of a training's start-up that keeps the cores busy."""
 
 
 def child_environment() -> dict[str, str]:
@@ -18,3 +31,126 @@ def child_environment() -> dict[str, str]:
     if top.name not in INSTALLED:
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(top), os.environ.get("PYTHONPATH"))))
     return environment
+
+
+class Kind(Enum):
+    """Resource that a process needs."""
+
+    TRAINING = "training"
+    ON_GPU = "evaluation on the GPU"
+    ON_CORES = "evaluation on the cores"
+
+
+@dataclass(eq=False)
+class Job:
+    """A process that the pool will run."""
+
+    kind: Kind
+    command: list[str]
+    output: Path
+    """File for its standard output and errors."""
+    done: Callable[["Job", int], Iterable["Job"]]
+    """Function that is called with the job and its exit code, and returns the jobs that follow."""
+    told: bool = False
+    """True after the pool has asked the process to end."""
+    process: Popen[bytes] | None = field(default=None, repr=False)
+
+    @property
+    def stages(self) -> Path:
+        """File that lists the finished stages of its start-up."""
+        return self.output.with_suffix(".stages")
+
+    @property
+    def starting(self) -> bool:
+        """True while the process imports modules and builds its task."""
+        return not (self.stages.is_file() and BUILT in self.stages.read_text(encoding="utf-8"))
+
+    def start(self) -> None:
+        """Start the process in its own process group, so that Ctrl-C reaches it only through the pool."""
+        make_folder(self.output.parent)
+        self.stages.unlink(missing_ok=True)
+        with self.output.open("wb") as output:
+            environment = child_environment() | {STAGES_FILE: str(self.stages)}
+            self.process = Popen(
+                self.command, stdin=DEVNULL, stdout=output, stderr=STDOUT, env=environment, start_new_session=True
+            )
+
+    def tell(self, number: int) -> None:
+        """Send a signal to the process and to its child processes."""
+        if self.process is not None and self.process.poll() is None:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.process.pid, number)
+
+
+class WorkerPool:
+    """Pool that runs jobs until the queue is empty. A job that fails does not end the others.
+
+    Trainings start in the order of the queue. Each starts when the one before it has built its task, so that start-up
+    overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
+    """
+
+    def __init__(self, room: dict[Kind, int], shared: tuple[Kind, ...] = ()) -> None:
+        """Take the number of jobs of each kind that run at once, and the kinds that wait for all trainings."""
+        self.room, self.shared = room, shared
+        self.waiting: list[Job] = []
+        self.running: list[Job] = []
+        self.stopped = False
+
+    def run(self, jobs: Iterable[Job]) -> None:
+        """Run jobs and the jobs that follow from them. After `stop`, wait for running jobs only."""
+        self.waiting += jobs
+        try:
+            while self.running or (self.waiting and not self.stopped):
+                for job in [] if self.stopped else [*self.waiting]:
+                    if self._may_start(job):
+                        self.waiting.remove(job)
+                        job.start()
+                        self.running.append(job)
+                time.sleep(POLL_S)
+                for job in [*self.running]:
+                    if self.stopped and not job.told:
+                        job.told = True
+                        job.tell(signal.SIGTERM)
+                    code = job.process.poll() if job.process else None
+                    if code is not None:
+                        self.running.remove(job)
+                        job.stages.unlink(missing_ok=True)
+                        self.waiting += job.done(job, code)
+        finally:
+            self._end_at_once()
+
+    def stop(self) -> None:
+        """Start no more jobs and ask the running ones to end. A signal handler may call this."""
+        self.stopped = True
+
+    def _may_start(self, job: Job) -> bool:
+        same = [other for other in self.running if other.kind is job.kind]
+        if len(same) >= self.room[job.kind]:
+            return False
+        if job.kind is Kind.TRAINING:
+            return not any(other.starting for other in same)
+        trainings = any(other.kind is Kind.TRAINING for other in (*self.running, *self.waiting))
+        return not (job.kind in self.shared and trainings)
+
+    def _end_at_once(self) -> None:
+        """End all running jobs before this process ends."""
+        for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):
+            for job in self.running:
+                job.tell(number)
+            until = time.monotonic() + PATIENCE_S
+            while any(job.process and job.process.poll() is None for job in self.running) and time.monotonic() < until:
+                time.sleep(POLL_S)
+        self.running.clear()
+
+
+def why_failed(job: Job, code: int) -> str:
+    """Return one line on why a job failed: its own error message, else its signal or exit code."""
+    text = job.output.read_text(encoding="utf-8", errors="replace") if job.output.is_file() else ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("error: ")]
+    if errors:
+        return errors[-1].removeprefix("error: ")
+    if code < 0:
+        named = {number.value: number.name for number in signal.Signals}
+        return f"killed by {named.get(-code, f'signal {-code}')}" + (", maybe out of memory" if code == -9 else "")
+    return lines[-1] if lines else f"exit code {code}"

@@ -75,7 +75,7 @@ def command_of_ours() -> str | None:
     if "-m" in given[:-1]:
         name = given[given.index("-m") + 1]
         return "module" if name == "legged" or name.startswith("legged.") else None
-    script = Path(sys.argv[0]) if sys.argv and sys.argv[0] else Path("-")
+    script = Path(*sys.argv[:1])
     if script.stem == "legged":
         return "installed"
     top = Path(__file__).resolve().parents[2]
@@ -97,13 +97,9 @@ def only_lists() -> bool:
     does not count.
     """
     given = sys.orig_argv
-    if sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged":
-        words = given[given.index("-m") + 2 :]
-    elif sys.argv and Path(sys.argv[0]).stem == "legged":
-        words = sys.argv[1:]
-    else:
-        return False
-    return words[:1] in ([], ["--help"], ["-h"], ["list"])
+    module = sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged"
+    installed = Path(*sys.argv[:1]).stem == "legged"
+    return (module or installed) and sys.argv[1:2] in ([], ["--help"], ["-h"], ["list"])
 
 
 def in_main_thread() -> bool:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,8 +23,6 @@ OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_nam
 """Settings that the sweep sets itself."""
 EVALUATIONS = 10
 """Default number of evaluations of a trial."""
-DIGITS = 4
-"""Significant digits of drawn numbers."""
 NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
 
 
@@ -37,7 +36,7 @@ class ParameterConfig:
     """Greatest value."""
     log: bool = False
     """Draw from the logarithm of the range."""
-    choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True})
+    choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True, "unique": True})
     """Values to try, in place of a range."""
 
 
@@ -88,28 +87,24 @@ class Parameter:
     """A swept setting."""
 
     path: str
-    kind: Literal["whole", "number", "choice"]
-    low: float = 0.0
-    high: float = 0.0
-    log: bool = False
-    choices: tuple[str, ...] = ()
-    """Values as JSON."""
+    distribution: Any
+    """Optuna's distribution of whole numbers, of numbers, or of choices as JSON."""
 
     def value(self, drawn: Any) -> Any:
-        """Return the value of the setting from a drawn number, rounded to a few digits, or from the text of a choice."""
-        if self.kind == "choice":
+        """Return the value of the setting from a drawn number, rounded to four digits, or from the text of a choice."""
+        if isinstance(drawn, str):
             return json.loads(drawn)
-        if self.kind == "whole":
-            return int(drawn)
-        return min(max(float(f"{drawn:.{DIGITS}g}"), self.low), self.high)
+        if isinstance(drawn, int):
+            return drawn
+        return min(max(float(f"{drawn:.4g}"), self.distribution.low), self.distribution.high)
 
     def drawn(self, value: Any) -> Any:
         """Return the drawn number or text for a value of the setting; None if the value is not among those to try."""
-        if self.kind == "choice":
-            return next((text for text in self.choices if json.loads(text) == value), None)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
+        if hasattr(self.distribution, "choices"):
+            return next((text for text in self.distribution.choices if json.loads(text) == value), None)
+        if isinstance(value, bool) or not isinstance(value, int | float):
             return None
-        return value if self.value(value) == value else None
+        return value if self.distribution.low <= value <= self.distribution.high and self.value(value) == value else None
 
 
 @dataclass(frozen=True)
@@ -137,6 +132,10 @@ class Plan:
         own = self.own
         return {one.path: one.drawn(own[one.path]) for one in self.parameters}
 
+    def settings(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
+        """Return dotted path -> value of the settings of a trial, from the drawn numbers and texts."""
+        return {one.path: one.value(drawn[one.path]) for one in self.parameters if one.path in drawn}
+
     @property
     def folder(self) -> Path:
         """Folder of the sweep's files and of the run folders of its trials."""
@@ -151,6 +150,13 @@ class Plan:
     def minimize(self) -> bool:
         """True if smaller values are better."""
         return self.until_target or lower_is_better(self.figure)
+
+    @property
+    def negated(self) -> bool:
+        """True if intermediate figures are negated when they are reported: the values of trials are times, where less is
+        better, but more of the figure is better.
+        """
+        return self.until_target and not lower_is_better(self.figure)
 
     @property
     def objective_text(self) -> str:
@@ -170,22 +176,20 @@ class Plan:
             {name: given[name] for name in ("task", "seeds", "objective", "overrides", "parameters")}, sort_keys=True
         )
 
-    def with_trials(self, trials: int) -> "Plan":
-        """Return the plan with another number of trials."""
-        return replace(self, given=replace(self.given, trials=trials))
-
-    @property
-    def negated(self) -> bool:
-        """True if intermediate figures are negated when they are reported: the values of trials are times, where less is
-        better, but more of the figure is better.
-        """
-        return self.until_target and not lower_is_better(self.figure)
-
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
-        """Return the arguments of `legged train` for a trial of that number."""
-        target = self.given.objective.target
-        goal = {} if target is None else {f"train.runner.stop_at.{self.figure}": target}
-        settings = {**self._own_defaults(), **self.given.overrides, **values, **goal}
+        """Return the arguments of `legged train` for a trial of that number: with evaluations that make trials comparable,
+        and with neither report nor film, which would take longer than many trials; `legged runs report` makes them later.
+        """
+        runner, target = self.cfg.train.runner, self.given.objective.target
+        settings = {
+            "train.runner.report": False,
+            "train.runner.film": False,
+            "train.runner.evaluate_interval": runner.evaluate_interval,
+            "train.runner.evaluate_share": runner.evaluate_share,
+            **self.given.overrides,
+            **values,
+            **({} if target is None else {f"train.runner.stop_at.{self.figure}": target}),
+        }
         flags = [self.task, "--seed", str(seed), "--experiment-name", self.name]
         flags += ["--run-name", f"trial{number:03d}_s{seed}", "--note", self.note(values, number)]
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
@@ -194,17 +198,6 @@ class Plan:
         """Return the note for the runs of a trial: its drawn values."""
         drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
         return f"trial {number} of {self.name}: {', '.join(drawn)}"
-
-    def _own_defaults(self) -> dict[str, Any]:
-        """Return default overrides of trials: evaluations that make them comparable, and neither report nor film, which would
-        take longer than many trials; `legged runs report` makes them later.
-        """
-        return {
-            "train.runner.report": False,
-            "train.runner.film": False,
-            "train.runner.evaluate_interval": self.cfg.train.runner.evaluate_interval,
-            "train.runner.evaluate_share": self.cfg.train.runner.evaluate_share,
-        }
 
 
 def sweep_file(text: str) -> Path:
@@ -221,21 +214,17 @@ def sweep_file(text: str) -> Path:
     raise ConfigError(f"sweep: there is no file {shown(text)}{suggest(text[:100], names, 'sweeps')}")
 
 
-def read_sweep(path: Path) -> SweepConfig:
-    """Read the file of a sweep.
+def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
+    """Read the file of a sweep, check it against its task, and return the plan. `trials` takes the place of their number in
+    the file.
 
     Raises:
-        ConfigError: the file does not describe a sweep.
+        ConfigError: Optuna is missing, a setting is unknown, a value is out of bounds, or the objective is not measured.
     """
-    return build(SweepConfig, read_yaml(path), "", Origins(), str(path))
-
-
-def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
-    """Check the file of a sweep against its task, and return the plan.
-
-    Raises:
-        ConfigError: a setting is unknown, a value is out of bounds, or the objective is not measured.
-    """
+    if find_spec("optuna") is None:
+        raise ConfigError("sweep: needs the package optuna, which is not installed here: pip install optuna")
+    given = build(SweepConfig, read_yaml(path), "", Origins(), str(path))
+    given = given if trials is None else replace(given, trials=trials)
     name = given.name or f"sweep_{path.stem}"
     if not is_plain_name(name):
         raise ConfigError(f"{path}: name: expected {PLAIN}; got {shown(name)}")
@@ -247,10 +236,8 @@ def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
         for key in getattr(given, section):
             if key in OWN or key.startswith(f"{OWN[-1]}."):
                 raise ConfigError(f"{path}: {section}: {key}: is set by the sweep itself (seeds, name, objective)")
-    task, file = given.task, None
-    if task.endswith(YAML_ENDINGS):
-        file = relative(path.parent / task)
-        task = register_file(file, f"{path}: task")
+    named = relative(path.parent / given.task) if given.task.endswith(YAML_ENDINGS) else given.task
+    task = register_file(named, f"{path}: task") if named.endswith(YAML_ENDINGS) else named
     with _said_in(path, "overrides"):
         cfg = task_config(task, given.overrides.items(), on_cpu)
     runner = cfg.train.runner
@@ -261,59 +248,44 @@ def plan_sweep(given: SweepConfig, path: Path, on_cpu: bool) -> Plan:
         changes.append(("train.runner.evaluate_share", 1.0))  # trials are compared at the same iterations
     cfg = override(cfg, changes)
     parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())
-    return Plan(name, given, cfg, _figure(given, cfg, path), parameters, file or task)
-
-
-def _figure(given: SweepConfig, cfg: TaskConfig, path: Path) -> str:
-    """Return the figure of the objective.
-
-    Raises:
-        ConfigError: evaluations do not measure it, or the target is missing.
-    """
-    figures, objective = evaluated_figures(task_class(cfg.task), cfg), given.objective
+    figures, objective = evaluated_figures(task_class(task), cfg), given.objective
     figure = objective.figure or figures[0]
     if figure not in figures:
-        where = f"{path}: objective.figure"
-        raise ConfigError(
-            f"{where}: evaluations of '{cfg.task}' find no {shown(figure)}{suggest(figure, figures, 'they find')}"
-        )
+        known = suggest(figure, figures, "they find")
+        raise ConfigError(f"{path}: objective.figure: evaluations of '{cfg.task}' find no {shown(figure)}{known}")
     if objective.take in ("time", "steps") and objective.target is None:
         raise ConfigError(f"{path}: objective.target: the {objective.take} until what value of {figure}? Give a number")
-    return figure
+    return Plan(name, given, cfg, figure, parameters, named)
 
 
 def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> Parameter:
-    """Return the swept setting; the ends of its range and all its choices must be valid values.
+    """Return the swept setting; the ends of its range and all its choices must be valid values."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    Raises:
-        ConfigError: they do not.
-    """
     where = f"{path}: parameters: {key}"
     if one.choices:
         if one.low is not None or one.high is not None or one.log:
             raise ConfigError(f"{where}: choices take the place of low, high and log; give one or the other")
-        _tried(key, one.choices, cfg, path)
-        texts = tuple(json.dumps(value) for value in one.choices)
-        if len({*texts}) < len(texts):
-            raise ConfigError(f"{where}.choices: names one twice; each may come once")
-        return Parameter(key, "choice", choices=texts)
+        _try(key, one.choices, cfg, path)
+        return Parameter(key, CategoricalDistribution([json.dumps(value) for value in one.choices]))
     if one.low is None or one.high is None:
         raise ConfigError(f"{where}: expected low and high of a range, or choices")
     if not one.low < one.high:
         raise ConfigError(f"{where}: low must be below high, got {one.low:g} and {one.high:g}")
     if one.log and one.low <= 0.0:
         raise ConfigError(f"{where}: with log, low must be above 0, got {one.low:g}")
-    whole = isinstance(value_at(to_dict(cfg), key), int) and not isinstance(value_at(to_dict(cfg), key), bool)
-    ends = (one.low, one.high)
-    if whole:
-        if any(end != int(end) for end in ends):
-            raise ConfigError(f"{where}: expected whole numbers for low and high, got {one.low:g} and {one.high:g}")
-        ends = (int(one.low), int(one.high))
-    _tried(key, ends, cfg, path)
-    return Parameter(key, "whole" if whole else "number", *ends, log=one.log)
+    own = value_at(to_dict(cfg), key)
+    if isinstance(own, bool) or not isinstance(own, int):
+        _try(key, (one.low, one.high), cfg, path)
+        return Parameter(key, FloatDistribution(one.low, one.high, log=one.log))
+    low, high = int(one.low), int(one.high)
+    if (low, high) != (one.low, one.high):
+        raise ConfigError(f"{where}: expected whole numbers for low and high, got {one.low:g} and {one.high:g}")
+    _try(key, (low, high), cfg, path)
+    return Parameter(key, IntDistribution(low, high, log=one.log))
 
 
-def _tried(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
+def _try(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
     """Check the configuration with each value."""
     with _said_in(path, "parameters"):
         for value in values:

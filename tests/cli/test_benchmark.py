@@ -8,10 +8,18 @@ import torch
 from helpers import POLICY, TASK, call, small_config, small_task
 
 from legged import registry
-from legged.benchmarks.iteration_times import loops_of, time_iterations
-from legged.benchmarks.scale import without
-from legged.benchmarks.step_times import Driver, report, time_steps
-from legged.cli.benchmark import ground, scale, startup, step
+from legged.cli.benchmark import (
+    Driver,
+    ground,
+    loops_of,
+    report,
+    scale,
+    startup,
+    step,
+    time_iterations,
+    time_steps,
+    without,
+)
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.learning.student_runner import StudentRunner
@@ -250,7 +258,7 @@ def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):
         seen.append(command)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("legged.benchmarks.scale.subprocess.run", run)
+    monkeypatch.setattr("legged.cli.benchmark.subprocess.run", run)
     arguments = ["anymal_c_flat", "--sim-device", "cpu", "--robots=4", "--physics", "newton", "--solver", "xpbd"]
     assert scale.main(arguments) == 130
     (command,) = seen

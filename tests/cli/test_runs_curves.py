@@ -9,7 +9,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged.cli.runs import curves
 from legged.errors import ConfigError
 from legged.evaluation import learning_curves
-from legged.evaluation.reports.curves import levels, outcomes
+from legged.evaluation.learning_curves import levels, outcomes
 
 
 def write_run(folder, levels):

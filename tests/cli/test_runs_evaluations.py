@@ -7,7 +7,7 @@ import pytest
 from helpers import call
 
 from legged.cli.runs.evaluations import main
-from legged.evaluation.comparison import grouped, shares, spread
+from legged.evaluation.reports.comparison import grouped, shares, spread
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}
 

@@ -9,16 +9,15 @@ import sys
 import time
 from importlib import util
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
 from helpers import HANG_S, call, wait_for
 
+import legged
+from legged.cli.sweep import PRUNED, NoValue, value_of
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
-from legged.cli.sweep import worker
-from legged.cli.sweep.worker import NoValue, Worker
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_note
 from legged.learning.evaluations import Evaluated
@@ -26,15 +25,15 @@ from legged.learning.run_folder import checkpoints, run_config
 from legged.learning.timing import read_timing
 from legged.process.paths import data_folder
 from legged.registry import task_names
-from legged.sweeping import study
-from legged.sweeping.plan import Parameter, plan_sweep, read_sweep
-from legged.sweeping.report import importances, ranking, settings
-from legged.sweeping.study import Trials, is_dead, me
+from legged.sweeping import plan as planning
+from legged.sweeping import trials as study
+from legged.sweeping.plan import plan_sweep
+from legged.sweeping.trials import Trials, is_dead, me, ranking
 
-pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
+optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
 
-REPOSITORY = Path(sweep.__file__).parents[3]
+REPOSITORY = Path(legged.__file__).parents[1]
 FILE = {
     "task": "half_cheetah",
     "trials": 3,
@@ -65,7 +64,7 @@ def written(**changes) -> Path:
 
 def plan_of(**changes):
     path = written(**changes)
-    return plan_sweep(read_sweep(path), path, on_cpu=True)
+    return plan_sweep(path, on_cpu=True)
 
 
 def states(trials: Trials) -> list[str]:
@@ -117,7 +116,7 @@ def states(trials: Trials) -> list[str]:
     ],
 )
 def test_a_wrong_file_is_one_line_before_anything_is_trained(changes, words, monkeypatch, capsys):
-    monkeypatch.setattr(sweep, "Worker", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr("legged.cli.sweep.Worker", lambda *_: pytest.fail("trained"))
     written(**changes)
     assert call(sweep.main, FLAGS) == 2
     err = capsys.readouterr().err
@@ -130,7 +129,7 @@ def test_a_sweep_that_is_not_there_and_a_package_that_is_not_installed(monkeypat
     assert "there is no file 'anymal_c_flt'; did you mean 'anymal_c_flat'? (sweeps: " in capsys.readouterr().err
     written()
     found = util.find_spec
-    monkeypatch.setattr(study, "find_spec", lambda name: None if name == "optuna" else found(name))
+    monkeypatch.setattr(planning, "find_spec", lambda name: None if name == "optuna" else found(name))
     assert call(sweep.main, FLAGS) == 2
     assert capsys.readouterr().err == (
         "error: sweep: needs the package optuna, which is not installed here: pip install optuna\n"
@@ -139,12 +138,11 @@ def test_a_sweep_that_is_not_there_and_a_package_that_is_not_installed(monkeypat
 
 def test_values_are_of_the_setting_s_kind_and_within_the_range():
     rate, epochs, activation = plan_of().parameters
-    assert (rate.kind, epochs.kind, activation.kind) == ("number", "whole", "choice")
     assert rate.value(0.00123456) == 0.001235
     assert rate.value(0.01 + 1e-9) == 0.01
-    assert (epochs.value(2), type(epochs.value(2))) == (2, int)
+    assert epochs.distribution == optuna.distributions.IntDistribution(1, 3)
     assert activation.value('"tanh"') == "tanh"
-    dims = Parameter("train.policy.actor_hidden_dims", "choice", choices=("[8]", "[8, 4]"))
+    (dims,) = plan_of(parameters={"train.policy.actor_hidden_dims": {"choices": [[8], [8, 4]]}}).parameters
     assert dims.value("[8, 4]") == [8, 4]
 
 
@@ -154,7 +152,7 @@ def test_the_sweeps_of_this_package_are_right_and_are_no_tasks():
     assert "half_cheetah_cpu" not in task_names()
     for path in files:
         for on_cpu in (True, False):
-            plan = plan_sweep(read_sweep(path), path, on_cpu)
+            plan = plan_sweep(path, on_cpu)
             assert plan.name not in task_names()
             assert plan.cfg.train.runner.max_iterations >= 3 * plan.cfg.train.runner.evaluate_interval
 
@@ -179,7 +177,7 @@ def test_no_more_trials_are_begun_than_are_wanted_whoever_asks():
     first, second = Trials(plan_of()), Trials(plan_of(), worker=1)
     taken = [first.next(), second.next(), first.next()]
     assert [trial.number for trial in taken] == [0, 1, 2]
-    drawn = [first.draw(trial) for trial in taken]
+    drawn = [first.plan.settings(trial.params) for trial in taken]
     assert len({json.dumps(values) for values in drawn}) == 3
     assert first.next() is None
     assert second.next() is None
@@ -192,21 +190,20 @@ def test_no_more_trials_are_begun_than_are_wanted_whoever_asks():
 def test_a_trial_of_a_dead_process_is_tried_again_once_with_its_settings():
     trials, others = Trials(plan_of()), Trials(plan_of())
     trial = trials.next()
-    drawn = trials.draw(trial)
+    drawn = trials.plan.settings(trial.params)
     assert trials.take_back() == []
     trial.set_user_attr(study.OWNER, me() + "0")
     assert others.take_back() == [0]
     assert trials.take_back() == []
     assert states(trials) == ["FAIL", "WAITING"]
     again = trials.next()
-    assert (again.number, trials.draw(again)) == (1, drawn)
+    assert (again.number, trials.plan.settings(again.params)) == (1, drawn)
     assert trials.done == 0
     for tries in range(2, study.MOST_TRIES + 1):
         assert again.user_attrs[study.TRIES] == tries
         again.set_user_attr(study.OWNER, me() + "0")
         trials.take_back()
         again = trials.next()
-        trials.draw(again)
     assert states(trials) == [*["FAIL"] * (study.MOST_TRIES - 1), "PRUNED", "RUNNING"]
     assert study.TRIES not in again.user_attrs, "that is another one"
 
@@ -245,17 +242,16 @@ def history(*values: float) -> list[Evaluated]:
 )
 def test_the_objective_takes_what_it_says(objective, value):
     plan = plan_of(objective={"figure": "return", **objective})
-    of = Worker(plan, SimpleNamespace(), [])
-    assert of._taken(history(1.0, 7.0, math.nan, 3.0)) == value
+    assert value_of(plan, history(1.0, 7.0, math.nan, 3.0)) == value
     assert plan.minimize == ("target" in objective)
 
 
 def test_a_target_that_is_not_reached_gives_no_value():
-    of = Worker(plan_of(objective={"figure": "return", "take": "time", "target": 5.0}), SimpleNamespace(), [])
+    plan = plan_of(objective={"figure": "return", "take": "time", "target": 5.0})
     with pytest.raises(NoValue, match="did not reach 5; the last was 3"):
-        of._taken(history(1.0, 3.0))
+        value_of(plan, history(1.0, 3.0))
     with pytest.raises(NoValue, match="return is not finite"):
-        of._taken(history(math.nan))
+        value_of(plan, history(math.nan))
 
 
 # ---- sweeps ----------------------------------------------------------------------------------------------------------
@@ -272,7 +268,7 @@ def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
     best = ranking(plan, trials.all)[0]
     assert best.value == max(trial.value for trial in trials.all)
     for trial in trials.all:
-        wanted = settings(plan, trial)
+        wanted = plan.settings(trial.params)
         for run, seed in zip(trial.user_attrs[study.RUNS], (1, 2), strict=True):
             cfg = run_config(Path(run))
             assert cfg.env.seed == seed
@@ -291,11 +287,9 @@ def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
     assert all(f"`{path}=" in table for path in plan.given.overrides)
     assert plan.given.overrides
     found = yaml.safe_load((plan.folder / "best.yaml").read_text())
-    assert found["train"]["policy"]["activation"] == settings(plan, best)["train.policy.activation"]
+    assert found["train"]["policy"]["activation"] == plan.settings(best.params)["train.policy.activation"]
     for name in ("history", "parallel"):
         assert (plan.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    shares = importances(trials)
-    assert set(shares) in (set(), {parameter.path for parameter in plan.parameters})
     assert call(reporting.main, FLAGS) == 0
     assert f"best: trial {best.number}, last return: {best.value:.4g}" in capsys.readouterr().out
 
@@ -306,13 +300,13 @@ def test_a_trial_that_falls_behind_is_ended_and_keeps_its_run(monkeypatch):
     assert call(sweep.main, FLAGS) == 0
     (trial,) = Trials(plan_of(trials=1)).all
     assert trial.state.name == "PRUNED"
-    assert trial.user_attrs[study.WHY] == f"{worker.PRUNED} (after 1 iterations)"
+    assert trial.user_attrs[study.WHY] == f"{PRUNED} (after 1 iterations)"
     (run,) = trial.user_attrs[study.RUNS]
     assert list(checkpoints(Path(run))) == [0]
     assert not read_timing(Path(run)).finished
-    drawn = settings(plan_of(trials=1), trial)
+    drawn = plan_of(trials=1).settings(trial.params)
     words = ", ".join(f"{path.split('.', 1)[1]} {json.dumps(value)}" for path, value in drawn.items())
-    assert read_note(Path(run)) == f"trial 0 of sweep_mine: {words}; {worker.PRUNED} (after 1 iterations)"
+    assert read_note(Path(run)) == f"trial 0 of sweep_mine: {words}; {PRUNED} (after 1 iterations)"
 
 
 def test_settings_that_do_not_fit_each_other_have_no_value_and_end_nothing_else():

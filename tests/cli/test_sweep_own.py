@@ -7,9 +7,8 @@ import yaml
 from helpers import call
 
 from legged.cli.sweep import run as sweep
-from legged.sweeping.plan import plan_sweep, read_sweep
-from legged.sweeping.report import ranking, settings
-from legged.sweeping.study import Trials
+from legged.sweeping.plan import plan_sweep
+from legged.sweeping.trials import Trials, ranking
 
 pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -31,7 +30,7 @@ FLAGS = ["mine.yaml", "--sim-device", "cpu"]
 def plan_of(parameters):
     path = Path("mine.yaml")
     path.write_text(yaml.safe_dump({**FILE, "parameters": parameters}))
-    return plan_sweep(read_sweep(path), path, on_cpu=True)
+    return plan_sweep(path, on_cpu=True)
 
 
 AMONG = {
@@ -48,8 +47,8 @@ def test_of_processes_that_begin_at_once_one_makes_the_trial_of_the_own_settings
     assert plan.own["train.algorithm.learning_rate"] == plan.cfg.train.algorithm.learning_rate
     trials, beside = Trials(plan), Trials(plan, worker=1)
     first, second = trials.next(), beside.next()
-    assert trials.draw(first) == plan.own
-    assert beside.draw(second) != plan.own
+    assert trials.plan.settings(first.params) == plan.own
+    assert beside.plan.settings(second.params) != plan.own
 
 
 def test_what_is_found_stands_beside_the_own_settings(capsys):
@@ -58,7 +57,7 @@ def test_what_is_found_stands_beside_the_own_settings(capsys):
     out = capsys.readouterr().out
     assert "not among those tried" not in out
     all_trials = Trials(plan).all
-    assert [settings(plan, trial) == plan.own for trial in all_trials] == [True, False, False]
+    assert [plan.settings(trial.params) == plan.own for trial in all_trials] == [True, False, False]
     rank = ranking(plan, all_trials).index(all_trials[0]) + 1
     assert f"; the task's own settings: trial 0, {all_trials[0].value:.4g}, rank {rank} of 3" in out
     assert "Trial 0 has the task's own settings." in (plan.folder / "table.md").read_text()
@@ -76,5 +75,5 @@ def test_own_settings_that_are_not_among_those_tried_are_told(capsys):
     gamma = plan.own["train.algorithm.gamma"]
     said = f"of which these are not among those tried: train.algorithm.gamma {gamma}, train.policy.activation 'elu'\n"
     assert said in capsys.readouterr().out
-    assert all(settings(plan, trial)["train.algorithm.gamma"] <= 0.6 for trial in Trials(plan).all)
+    assert all(plan.settings(trial.params)["train.algorithm.gamma"] <= 0.6 for trial in Trials(plan).all)
     assert "own settings" not in (plan.folder / "table.md").read_text()

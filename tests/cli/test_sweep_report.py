@@ -13,9 +13,8 @@ from helpers import call
 from legged.cli.sweep import report as reporting
 from legged.cli.sweep import run as sweep
 from legged.config import parse_override
-from legged.sweeping.plan import plan_sweep, read_sweep
-from legged.sweeping.report import importances, table
-from legged.sweeping.study import Trials
+from legged.sweeping.plan import plan_sweep
+from legged.sweeping.trials import Trials, draw_figures, table
 
 optuna = pytest.importorskip("optuna", reason="the extra 'sweep' is not installed")
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -35,7 +34,7 @@ def test_a_trial_that_was_ended_early_stands_with_the_figure_it_had(objective, r
     given = {"task": "half_cheetah", "trials": 3, "objective": objective, "parameters": parameters}
     path = Path("mine.yaml")
     path.write_text(yaml.safe_dump(given))
-    plan = plan_sweep(read_sweep(path), path, on_cpu=True)
+    plan = plan_sweep(path, on_cpu=True)
     trial = optuna.trial.create_trial(state=optuna.trial.TrialState.PRUNED, intermediate_values={5: 1.0, 10: reported})
     assert f"; {said} |" in table(plan, [trial])
 
@@ -51,10 +50,10 @@ def test_the_command_of_the_best_trial_sets_what_it_was_trained_with():
     given = {"task": "anymal_c_flat", "parameters": {path: {"choices": values} for path, values in choices.items()}}
     path = Path("mine.yaml")
     path.write_text(yaml.safe_dump(given))
-    plan = plan_sweep(read_sweep(path), path, on_cpu=True)
+    plan = plan_sweep(path, on_cpu=True)
     wanted = {path: values[-1] for path, values in choices.items()}
     drawn = {path: json.dumps(value) for path, value in wanted.items()}
-    kinds = {one.path: optuna.distributions.CategoricalDistribution(one.choices) for one in plan.parameters}
+    kinds = {one.path: one.distribution for one in plan.parameters}
     text = table(plan, [optuna.trial.create_trial(params=drawn, distributions=kinds, value=0.5)], "own tasks.py")
     (command,) = [line for line in text.splitlines() if line.startswith("legged train ")]
     program, flags, settings = (shlex.split(command)[at] for at in (slice(2), slice(2, 5), slice(5, None)))
@@ -73,24 +72,23 @@ def test_nothing_is_said_to_matter_where_all_trials_are_alike():
     }
     path = Path("mine.yaml")
     path.write_text(yaml.safe_dump({"task": "half_cheetah", "parameters": values}))
-    trials = Trials(plan_sweep(read_sweep(path), path, on_cpu=True))
+    trials = Trials(plan_sweep(path, on_cpu=True))
     for _ in range(6):
         trial = trials.next()
-        trials.draw(trial)
         trials.study.tell(trial.number, 1920.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
-        assert importances(trials) == {}
+        assert "importance.png" not in {path.name for path in draw_figures(trials)}
 
 
 def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_reported_anywhere(capsys, monkeypatch):
     parameters = {"train.algorithm.learning_rate": {"low": 1e-4, "high": 1e-2}}
     path = Path("mine.yaml")
     path.write_text(yaml.safe_dump({"task": "half_cheetah", "trials": 1, "parameters": parameters}))
-    trials = Trials(plan_sweep(read_sweep(path), path, on_cpu=True))
+    trials = Trials(plan_sweep(path, on_cpu=True))
     trials.keep_to("cpu")
     trials.keep_to("cpu")
-    monkeypatch.setattr(sweep, "pick_device", lambda name: torch.device("cuda"))
+    monkeypatch.setattr("legged.cli.sweep.pick_device", lambda name: torch.device("cuda"))
     assert call(sweep.main, ["mine.yaml"]) == 2
     said = "error: --sim-device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
     assert capsys.readouterr().err.startswith(said)

@@ -10,8 +10,7 @@ import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
 from legged.cli import train
-from legged.commandline.command import run_main
-from legged.commandline.output import Output, forgiving_output, when_output_is_lost
+from legged.commandline.command import Output, forgiving_output, run_main, when_output_is_lost
 from legged.errors import ConfigError, RunError
 
 pytestmark = pytest.mark.usefixtures("workplace")

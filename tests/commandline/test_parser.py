@@ -5,11 +5,6 @@ import pytest
 from legged.process.command_parser import CommandParser
 
 
-def test_arguments_of_an_example_are_what_follows_the_program():
-    parser = CommandParser("legged runs table", "Do.", "legged runs table a", "legged runs table b")
-    assert parser.arguments_of("legged runs table --out 'x y' > a.txt") == ["--out", "x y"]
-
-
 @pytest.mark.parametrize("given", ["--num_envs", "--num-envs"])
 @pytest.mark.parametrize("form", ["{}=3", "{} 3"])
 def test_options_of_legged_gym_are_read_with_underscores_too(given, form):
@@ -26,11 +21,6 @@ def test_other_options_have_hyphens_alone(capsys):
     with pytest.raises(SystemExit):
         parser.parse_args(["--robots_per_point", "3"])
     assert "did you mean '--robots-per-point'?" in capsys.readouterr().err
-
-
-def test_a_command_with_one_example_is_not_built():
-    with pytest.raises(ValueError, match="at least 2 examples, got 1"):
-        CommandParser("x", "Do.", "python x.py")
 
 
 def test_paragraphs_of_a_description_are_filled_one_by_one_and_indented_lines_kept(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from helpers import HANG_S, TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
 
 from legged.cli import train
-from legged.commandline.stopping import SIGNALS, quiet_writers, stopping_on_signals
+from legged.commandline.command import SIGNALS, quiet_writers, stopping_on_signals
 from legged.process import startup
 
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -13,7 +13,7 @@ import legged.cli.train
 import legged.policies.restore
 import legged.registry
 from legged.cli import play, train
-from legged.cli.benchmark import common, step
+from legged.cli.benchmark import step
 from legged.cli.evaluate import grid
 
 SMALLER = (
@@ -51,7 +51,7 @@ def fails(monkeypatch, capsys):
     monkeypatch.setattr(legged.registry, "make_task", built)
     monkeypatch.setattr(legged.cli.train, "make_task", built)
     monkeypatch.setattr(legged.policies.restore, "make_task", built)
-    monkeypatch.setattr(common, "make_task", built)
+    monkeypatch.setattr("legged.cli.benchmark.make_task", built)
 
     def fails(main, arguments, *words):
         before = run_folders() if Path("logs").is_dir() else []

@@ -7,8 +7,8 @@ import torch
 from helpers import TASK, call, run_folders, tiny_run
 
 from legged.cli.evaluate import checkpoints
-from legged.evaluation import all_checkpoints
-from legged.evaluation.all_checkpoints import walks
+from legged.evaluation import following
+from legged.evaluation.following import walks
 from legged.learning.checkpoint import read_checkpoint, write_checkpoint
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -52,7 +52,7 @@ def test_the_file_says_under_what_conditions_checkpoints_were_judged_and_lost_co
     tiny_run(iterations=1)
     (folder,) = run_folders()
     figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "falls": 0.0, "contact_overflows": 3}
-    monkeypatch.setattr(all_checkpoints, "measure_tracking", lambda *_: figures)
+    monkeypatch.setattr(following, "measure_tracking", lambda *_: figures)
     assert checkpoints.main([*HERE, "--vx=0.5", "--vy=0", "--yaw=0", "sim.iterations=30"]) == 0
     result = json.loads((folder / "changed" / "time_to_walk.json").read_text())
     assert result["changes"] == {"sim.iterations": 30}

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from legged.cli.evaluate import grid
 from legged.config.schema import NewtonSolver
-from legged.evaluation import crossing
+from legged.evaluation import following
 
 GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]
 ENGINES = ["mujoco_warp", "mujoco", *(f"newton_{name}" for name in get_args(NewtonSolver))]
@@ -38,14 +38,14 @@ def result(engine: str, **changes: float | None) -> dict:
 
 
 def test_all_engines_there_are_take_part():
-    asked = [dict(engine.overrides) for engine in crossing.ENGINES.values()]
+    asked = [dict(engine.overrides) for engine in following.ENGINES.values()]
     names = [f"newton_{one['sim.solver']}" if "sim.solver" in one else one["sim.physics"] for one in asked]
-    assert names == list(crossing.ENGINES) == ENGINES
+    assert names == list(following.ENGINES) == ENGINES
 
 
 def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, capsys, monkeypatch):
-    chosen = {name: crossing.ENGINES[name] for name in ("mujoco", "newton_mujoco")}
-    monkeypatch.setattr(crossing, "ENGINES", chosen)
+    chosen = {name: following.ENGINES[name] for name in ("mujoco", "newton_mujoco")}
+    monkeypatch.setattr(following, "ENGINES", chosen)
     assert call(grid.main, [TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1"]) == 0
     out = capsys.readouterr().out
     found = json.loads((run / "crossing.json").read_text())
@@ -65,8 +65,8 @@ def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, 
 def test_the_file_says_what_was_changed(run, monkeypatch):
     figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "gait": {"base_height": 0.5}}
     figures |= {"falls": 0.0, "cost_of_transport": 0.5, "contact_overflows": 0}
-    monkeypatch.setattr(crossing, "ENGINES", {"mujoco": crossing.ENGINES["mujoco"]})
-    monkeypatch.setattr(crossing, "measure_tracking", lambda *_: figures)
+    monkeypatch.setattr(following, "ENGINES", {"mujoco": following.ENGINES["mujoco"]})
+    monkeypatch.setattr(following, "measure_tracking", lambda *_: figures)
     arguments = [TASK, "--physics", "all", "--sim_device", "cpu", *GRID, "sim.threads=1", "sim.iterations=30"]
     assert call(grid.main, arguments) == 0
     assert json.loads((run / "changed" / "crossing.json").read_text())["changes"] == {"sim.iterations": 30}
@@ -77,11 +77,11 @@ def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, ca
     rows = [result("mujoco"), result("newton_xpbd", **nothing, falls=1.0)]
     summary = {"task": TASK, "checkpoint": "m.pt", "grid": {"vx": [0], "vy": [0], "yaw": [0]}, "robots_per_cell": 2}
     summary["engines"] = rows
-    Console(width=110).print(crossing.crossing_table(summary))
+    Console(width=110).print(following.crossing_table(summary))
     line = next(line for line in capsys.readouterr().out.splitlines() if "newton_xpbd" in line)
     assert line.count("none") == 4
     assert "100.0 %" in line
-    crossing.draw_crossing(summary, tmp_path / "p.png")
+    following.draw_crossing(summary, tmp_path / "p.png")
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
 
 

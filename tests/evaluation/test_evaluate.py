@@ -15,10 +15,9 @@ from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import RunError
-from legged.evaluation import crossing, following, result_file, velocity_tracking
-from legged.evaluation.tracking_report import draw_tracking, print_tracking
+from legged.evaluation import following, result_file, velocity_tracking
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
-from legged.evaluation.velocity_tracking import measure_tracking
+from legged.evaluation.velocity_tracking import draw_tracking, measure_tracking, print_tracking
 from legged.play import demonstrations
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
@@ -114,10 +113,7 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
 def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen(monkeypatch):
     """Its time is up at the end of step 15, so that of 30 steps those from 10 to 13 are of its first episode."""
     counted = []
-    add = velocity_tracking._Sums.add
-    monkeypatch.setattr(
-        velocity_tracking._Sums, "add", lambda sums, task, alive: (counted.append(alive.tolist()), add(sums, task, alive))
-    )
+    monkeypatch.setattr(velocity_tracking.EstimateMeter, "add", lambda *given: counted.append(given[-1].tolist()))
     grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.2)
     result = on_grid(grid, stand, ("env.episode_length_s", 0.3))
     assert counted == [[True] * 2] * 4 + [[False] * 2] * 16
@@ -312,8 +308,7 @@ def test_more_robots_a_size_than_any_machine_holds_are_refused(capsys):
 
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("mine")
-    for module in (following, crossing):
-        monkeypatch.setattr(module, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
+    monkeypatch.setattr(following, "ready_to_track", lambda *_, **__: pytest.fail("measured"))
     arguments = [str(POLICY), "--sim_device", "cpu", "--out", str(tmp_path / "file")]
     for physics in ("mujoco", "all"):
         assert call(evaluate_grid.main, [*arguments, "--physics", physics]) == 2

@@ -9,13 +9,14 @@ import pytest
 import torch
 from helpers import call, kept_global_state, run_folders, tiny_run
 
-from legged.cli import play, terrain
+from legged.cli import play
 from legged.cli.benchmark import ground, step
 from legged.cli.evaluate import checkpoints, episodes, grid, policy
 from legged.cli.evaluate import gymnasium as in_gymnasium
 from legged.cli.runs import curves, evaluations
+from legged.cli.terrain import terrain
 from legged.errors import ConfigError
-from legged.evaluation.gymnasium_episodes import run_exported
+from legged.evaluation.episodes import run_exported
 
 pytestmark = pytest.mark.usefixtures("workplace")
 TASK = "half_cheetah"

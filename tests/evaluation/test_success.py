@@ -12,6 +12,7 @@ from legged import make_task
 from legged.config import override
 from legged.evaluation import success, tiles
 from legged.evaluation.intervals import wilson
+from legged.evaluation.measurement import Setting
 from legged.evaluation.success import (
     FELL,
     OPEN,
@@ -266,19 +267,22 @@ def test_the_policy_sees_what_it_saw_in_training():
     assert 0.2 < noise.abs().max() <= 0.2501  # 2.5 times U(-0.1, 0.1)
 
 
+def setting_of(cfg, overrides) -> Setting:
+    return Setting(TrainedPolicy(cfg, Path("model_0.pt")), torch.device("cpu"), Path(), overrides)
+
+
 def test_configuration_of_the_tasks(monkeypatch, capsys):
     """As trained, but for the ground, the commands and what is switched off on purpose; the command line comes last."""
     cfg = task_config("anymal_c", [("observations.noise_level", 0.7), ("terrain.num_rows", 10), *ENGINE], on_cpu=True)
     found = []
 
-    def fake(policy, name, sizes, robots, changes, device, graph):
+    def fake(setting, name, sizes, robots, changes):
         found.append(override(cfg, changes))
         return [point(size, torch.tensor([REACHED] * robots), torch.ones(robots)) for size in sizes], 3
 
     monkeypatch.setattr(success, "_on_type", fake)
-    policy = TrainedPolicy(cfg, Path("model_0.pt"))
-    sizes, asked = success.chosen_sizes(cfg, "stairs_up,pit", False, 1.0), [("sim.threads", 2)]
-    result = success.success_over_difficulty(policy, sizes, 5, asked, torch.device("cpu"))
+    sizes = success.chosen_sizes(cfg, "stairs_up,pit", False, 1.0)
+    result = success.success_over_difficulty(setting_of(cfg, [("sim.threads", 2)]), sizes, 5)
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["stairs_up: 6 sizes x 5 robots, 100 % got out", "pit: 6 sizes x 5 robots, 100 % got out"]
     assert result["contact_overflows"] == 6
@@ -304,15 +308,14 @@ def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(
     cfg = task_config("anymal_c", [("terrain.num_rows", 10), *ENGINE], on_cpu=True)
     found = []
 
-    def fake(policy, name, sizes, robots, changes, device, graph):
+    def fake(setting, name, sizes, robots, changes):
         found.append((name, sizes, override(cfg, changes).terrain))
         return [point(size, torch.tensor([REACHED] * robots), torch.ones(robots)) for size in sizes], 0
 
     monkeypatch.setattr(success, "_on_type", fake)
     asked = [("terrain.scale", 0.25), ("terrain.horizontal_scale", 0.025)]
     chosen = success.chosen_sizes(cfg, "stairs_up,narrow_stairs_up", False, 0.25)
-    policy = TrainedPolicy(cfg, Path("model_0.pt"))
-    result = success.success_over_difficulty(policy, chosen, 2, asked, torch.device("cpu"))
+    result = success.success_over_difficulty(setting_of(cfg, asked), chosen, 2)
     rule = result["definition"]
     assert (rule["distance_m"], rule["vx"], rule["vy"][1]) == pytest.approx((1.0, 0.375, 0.05))
     assert result["types"]["stairs_up"]["trained_to"] == pytest.approx(0.212)

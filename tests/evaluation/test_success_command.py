@@ -19,13 +19,15 @@ from legged.config import override
 from legged.errors import ConfigError
 from legged.evaluation import success
 from legged.evaluation.following import evaluate_following
-from legged.evaluation.overflows import warn_of_overflows
+from legged.evaluation.measurement import Setting, warn_of_overflows
 from legged.evaluation.success import (
     chosen_sizes,
+    is_beyond,
+    panels_of,
     sizes_of,
     trained_to,
+    with_other_engines,
 )
-from legged.evaluation.success_report import is_beyond, panels_of, with_other_engines
 from legged.evaluation.tiles import cell_for, dividing_cell, on_terrain, rough_ground, rough_side, tiles_of_sizes
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import measure_tracking, place_to_track
@@ -153,7 +155,7 @@ def test_bumps_are_as_high_as_is_said_for_a_small_robot(tmp_path, capsys):
     assert (heights.min(), heights.max()) == pytest.approx((-0.0295, 0.0295), abs=1e-4)
     policy = TrainedPolicy(cfg, find_checkpoint(POLICY.with_name("go2"), None))
     grid = Grid([0.5], [0.0], [0.0], robots=1, hold_s=1.2)
-    assert evaluate_following(policy, grid, {}, 1, [], torch.device("cpu"), False, tmp_path) == 0
+    assert evaluate_following(Setting(policy, torch.device("cpu"), tmp_path, graph=False), grid) == 0
     assert "on level ground with bumps of up to 2.9 cm" in capsys.readouterr().out
     assert json.loads((tmp_path / "evaluation_mujoco.json").read_text())["rough"]["bumps"] == pytest.approx(0.0295, abs=1e-4)
 
@@ -275,11 +277,11 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
 def test_evaluate_alone_measures_both_on_the_task_s_own_grid_and_types(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(trained)
     asked = []
-    monkeypatch.setattr(evaluate, "evaluate_following", lambda policy, *rest: asked.append((policy, *rest)) or 0)
+    monkeypatch.setattr(evaluate, "evaluate_following", lambda *given: asked.append(given) or 0)
     assert call(evaluate.main, ["anymal_c", *HERE, "--out", str(tmp_path / "o")]) == 0
-    ((policy, grid, sizes, robots, *_),) = asked
+    ((setting, grid, sizes, robots),) = asked
     assert grid.axes["vx"] == [-1.0, -0.5, 0.0, 0.5, 1.0]
-    assert {name for name, share in policy.cfg.terrain.proportions.items() if share > 0.0} == set(sizes)
+    assert {name for name, share in setting.cfg.terrain.proportions.items() if share > 0.0} == set(sizes)
     assert robots == 32
 
 

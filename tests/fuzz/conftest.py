@@ -1,4 +1,4 @@
-"""Fuzzing: a few dozen cases a test by default, as many as asked for by `FUZZ_CASES=1000 pytest tests/fuzz`."""
+"""Fuzzing: eight cases a test by default, as many as asked for by `FUZZ_CASES=1000 pytest tests/fuzz`."""
 
 import contextlib
 import io
@@ -10,7 +10,7 @@ import pytest
 from helpers import kept_global_state, tiny_run
 from hypothesis import HealthCheck, settings
 
-CASES = int(os.environ.get("FUZZ_CASES", "25"))
+CASES = int(os.environ.get("FUZZ_CASES", "8"))
 settings.register_profile(
     "fuzz",
     max_examples=CASES,

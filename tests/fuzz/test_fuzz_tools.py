@@ -10,11 +10,12 @@ from helpers import TASK, TINY_TRAINING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from legged.cli import play, terrain, train
+from legged.cli import play, train
 from legged.cli.benchmark import step
 from legged.cli.evaluate import checkpoints, grid
 from legged.cli.evaluate import terrain as success
 from legged.cli.runs import compare, curves, evaluations, report, table
+from legged.cli.terrain import terrain
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
 

@@ -17,8 +17,8 @@ from test_resume import content, same
 
 from legged.cli import train
 from legged.errors import ConfigError
-from legged.evaluation.estimation import EstimateMeter
 from legged.evaluation.learning_curves import read_scalars
+from legged.evaluation.velocity_tracking import EstimateMeter
 from legged.graph.step_graph import ForbidHostReads
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint

@@ -16,20 +16,21 @@ pytestmark = pytest.mark.usefixtures("workplace")
 EVENTFUL = ["env.episode_length_s=0.3", "commands.resampling_time_s=0.1", "domain_rand.push_interval_s=0.06"]
 """Episodes, commands and pushes that end, change and come within a few iterations of four steps."""
 VARIANTS = {
-    "flat": [],
+    "curriculum of commands": ["commands.curriculum.window_s=0.02", "commands.curriculum.threshold=0.0"],
     "stock": ["--runner", "stock"],
-    "normalised": ["train.policy.obs_normalization=true"],
-    "curriculum": ["commands.curriculum.window_s=0.02", "commands.curriculum.threshold=0.0"],
-    "torques from velocities": ["control.control_type=V"],
-    "terrain": ["--task", "anymal_c"],
+    "normalised, rmsprop": ["train.policy.obs_normalization=true", "train.algorithm.optimizer=rmsprop"],
+    "terrain, torques from velocities": ["--task", "anymal_c", "control.control_type=V"],
     "history": ["--task", "anymal_c_proprio"],
-    "estimator": ["--task", "anymal_c_estimator", "train.policy.estimator.latent=2"],
-    "bounds of the std": ["train.policy.min_noise_std=0.498", "train.policy.noise_std_type=log"],
+    "estimator, bounds of the std": [
+        *("--task", "anymal_c_estimator", "train.policy.estimator.latent=2"),
+        *("train.policy.min_noise_std=0.498", "train.policy.noise_std_type=log"),
+    ],
     "std by state": ["train.policy.state_dependent_std=true"],
-    "rmsprop": ["train.algorithm.optimizer=rmsprop"],
     "lstm": ["train.policy.rnn_type=lstm", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false"],
-    "forces": ["domain_rand.forces={pull: {y: [-80, 80], interval_s: [0.02, 0.06], duration_s: [0.06, 0.1]}}"],
-    "gru": ["train.policy.rnn_type=gru", "train.policy.rnn_num_layers=2", "train.algorithm.symmetry=false"],
+    "gru, forces": [
+        *("train.policy.rnn_type=gru", "train.policy.rnn_num_layers=2", "train.algorithm.symmetry=false"),
+        "domain_rand.forces={pull: {y: [-80, 80], interval_s: [0.02, 0.06], duration_s: [0.06, 0.1]}}",
+    ],
 }
 
 

@@ -19,7 +19,7 @@ def migrated(capsys):
     """migrated(text, arguments...): migrate a file of that text, which goes well."""
 
     def migrated(text: str, *arguments: str, path: str = "fork_config.py") -> Result:
-        code = call(migrate.main, [written(text, path), *arguments])
+        code = call(migrate.main, [written(text, path), *arguments, "--run"])
         out, err = capsys.readouterr()
         assert code == 0, err
         return Result(out)
@@ -32,7 +32,7 @@ def refused(capsys):
     """refused(arguments...): the one line that the command ends with."""
 
     def refused(*arguments: str) -> str:
-        assert call(migrate.main, list(arguments)) == 2
+        assert call(migrate.main, [*arguments, "--run"]) == 2
         out, err = capsys.readouterr()
         assert (out, err.count("\n")) == ("", 1)
         return err

@@ -206,9 +206,9 @@ def sections(**sections: str) -> str:
     text = FLAT
     for name, lines in sections.items():
         if f"    class {name}(" in text:
-            key = lines.partition(" = ")[0]
-            text = re.sub(rf"        {key} = .*\n", "", text)
-            text = re.sub(rf"(    class {name}\(.*\n)", rf"\1        {lines}\n", text)
+            for line in lines.splitlines():
+                text = re.sub(rf"        {line.partition(' = ')[0]} = .*\n", "", text)
+                text = re.sub(rf"(    class {name}\(.*\n)", rf"\1        {line}\n", text)
         else:
             inherited = f"LeggedRobotCfg.{name}"
             body = "\n".join(f"        {line}" for line in lines.splitlines())
@@ -229,6 +229,8 @@ class Result:
         self.data = read_yaml(self.path)
         self.text = self.path.read_text()
         self.lost = [line.removeprefix("not mapped: ") for line in out.splitlines() if line.startswith("not mapped: ")]
+        plain = re.search(r"without counterpart \(.*\): (.*)", out)
+        self.plain = plain[1].split(", ") if plain else []
 
 
 def built(result: Result, *overrides):

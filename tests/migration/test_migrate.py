@@ -121,17 +121,14 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
     assert set(lost) == {
         "init_state.default_joint_angles",
         "control.stiffness",
-        "control.hip_reduction",
-        "commands.ranges.body_pitch",
         "asset.penalize_contacts_on",
-        "env.num_one_step",
-        "rewards.scales.joint_power",
         "runner_class_name",
-        "runner.resume",
     }
+    assert sorted(result.plain) == ["commands.ranges.body_pitch", "control.hip_reduction", "env.num_one_step"]
     for setting, (place, line) in lost.items():
         assert place == f"fork_config.py:{line_of(GO2, setting.rpartition('.')[2] + ' = ')}", line
-    assert "write a method _reward_joint_power and rewards.scales.joint_power: " in lost["rewards.scales.joint_power"][1]
+    where = f"fork_config.py:{line_of(GO2, 'joint_power = ')}"
+    assert f"paste: _reward_joint_power ({where}), then set rewards.scales.joint_power: -2e-05\n" in result.out
     assert "'tail' is part of no body or shape" in lost["asset.penalize_contacts_on"][1]
     assert "'wheel' is part of no joint" in lost["control.stiffness"][1]
     assert "torso_joint" in lost["init_state.default_joint_angles"][1]
@@ -155,7 +152,7 @@ def test_mixins_and_a_base_of_the_forks_own(migrated, refused):
     result = migrated(MIXINS, "--task", "MixedCfg", "--out", "tasks", path="pkg/mixed.py")
     assert result.path == Path("tasks/mixed.yaml")
     assert result.data["env"] == {"num_envs": 1024, "episode_length_s": 10}
-    assert result.data["commands"] == {"resampling_time_s": 4.0, "heading_command": False}
+    assert (result.data["commands"]["resampling_time_s"], result.data["commands"]["heading_command"]) == (4.0, False)
     terrain = result.data["terrain"]
     assert (terrain["num_rows"], terrain["num_cols"], terrain["max_init_terrain_level"]) == (4, 10, 3)
     # The two halves of 0.1 / 0.9 have no column of ten each, and become one; what comes after legged_gym's types is left out.
@@ -163,7 +160,7 @@ def test_mixins_and_a_base_of_the_forks_own(migrated, refused):
     assert set(shares) in ({"slope_up", "obstacles", "stepping_stones", "gap", "pit"}, {"slope_down", *list(shares)[1:]})
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares["obstacles"] == pytest.approx(0.5 / 0.9, abs=2e-4)
-    assert any("legged_gym has 8 types" in line for line in result.lost)
+    assert any("not here or too large: entry 9, entry 10" in line for line in result.lost)
     task = built(result, ("terrain.border_size", 5.0))
     assert task.robot.file.spawn_height == 0.7
 
@@ -172,7 +169,7 @@ def test_a_task_may_be_asked_for_by_the_name_that_it_is_registered_by(migrated, 
     written(REGISTERED, "fork/envs/__init__.py")
     result = migrated(TWO, "--task", "b_walks", path="fork/envs/mine/config.py")
     assert (result.path.name, result.data["sim"], result.data["env"]["seed"]) == ("b_walks.yaml", {"dt": 0.002}, 5)
-    assert call(migrate.main, ["fork/envs/__init__.py", "--task", "a_walks"]) == 0
+    assert call(migrate.main, ["fork/envs/__init__.py", "--task", "a_walks", "--run"]) == 0
     capsys.readouterr()
     assert "sim" not in read_yaml(Path("a_walks.yaml"))
     assert "it registers tasks: --task (tasks: a_walks, b_walks)" in refused("fork/envs/__init__.py")
@@ -207,7 +204,7 @@ def test_files_are_not_written_over_unless_asked_to(migrated, refused):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("class A(:\n", "fork_config.py:1: is not a readable Python file"),
+        ("class A(:\n", "fork_config.py:1: the file does not run: SyntaxError"),
         ("x = 1\n", "fork_config.py: has no configuration of an environment"),
         (BASE + "class P(LeggedRobotCfgPPO):\n    pass\n", "has no configuration of an environment"),
     ],
@@ -222,9 +219,3 @@ def test_other_mistakes_of_the_command_line(refused):
     assert "--robot: there is no robot 'anymal'; did you mean 'anymal_" in refused("fork_config.py", "--robot", "anymal")
     assert "--task: the name of a task must be a plain name" in refused("fork_config.py", "--task", "a/b")
     assert not Path("plain.yaml").exists()
-
-
-def test_nothing_of_the_file_is_run(migrated):
-    text = "open('run.txt', 'w').write('x')\nimport sys\nsys.exit(3)\n" + BASE + FLAT
-    migrated(text)
-    assert not Path("run.txt").exists()

@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 from helpers import HANG_S
 
-from legged.cli import warmup
+from legged.cli.warmup import warmup
 from legged.physics.warp.compile import Build, Line, compile_ahead, launched
 
 # Two modules with a kernel each, one of them launched with two block sizes, and a third that nothing launches.

@@ -13,7 +13,6 @@ from legged.process.paths import (
     ABANDONED_S,
     make_folder,
     ready_to_write,
-    ready_to_write_file,
     replacing,
     write_bytes,
     write_text,
@@ -139,15 +138,3 @@ def test_a_folder_that_cannot_be_is_the_users_mistake(check, name, tmp_path):
     with pytest.raises(ConfigError, match="cannot make the folder"):
         check(tmp_path / name)
     assert names(tmp_path) == ["dangling", "file"]
-
-
-@pytest.mark.parametrize("name", ["\0", "a\0b.png", "x" * 256])
-def test_a_name_that_no_file_can_have_is_refused_before_the_work(tmp_path, name):
-    with pytest.raises(ConfigError, match="--out: not a valid file name"):
-        ready_to_write_file("--out", tmp_path / name)
-
-
-def test_a_file_is_called_what_it_is(tmp_path):
-    ready_to_write_file("--out", tmp_path / "a.png", endings=(".gif", ".png"))
-    with pytest.raises(ConfigError, match=r"--out: must end in \.gif or \.png, got 'a\.txt'"):
-        ready_to_write_file("--out", tmp_path / "a.txt", endings=(".gif", ".png"))

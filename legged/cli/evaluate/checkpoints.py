@@ -4,10 +4,10 @@ Every checkpoint of the run is measured over the grid of commands. time_to_walk.
 the start of the training's process, the first one walked. A small train.runner.save_interval makes the answer finer.
 """
 
-from legged.cli.evaluate.common import add_grid_arguments, check_follows_commands, evaluation_parser, grid_of, ready, settle
+from legged.cli.evaluate.common import add_grid_arguments, check_number, evaluation_parser, grid_of, settle
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.all_checkpoints import WALKING_FALLS, WALKING_RMSE, check_limits, evaluate_all_checkpoints
+from legged.evaluation.following import WALKING_FALLS, WALKING_RMSE, evaluate_all_checkpoints
 from legged.process.command_parser import CommandParser
 
 
@@ -20,15 +20,10 @@ def build_parser() -> CommandParser:
         "legged evaluate checkpoints go1_flat/2026-11-22_05-38-19 --rmse 0.2 --falls 0.01",
     )
     add_grid_arguments(parser)
-    parser.add_argument(
-        "--rmse",
-        type=float,
-        default=WALKING_RMSE,
-        help=f"largest velocity RMSE of a robot that walks [m/s]; {WALKING_RMSE} by default",
-    )
-    parser.add_argument(
-        "--falls", type=float, default=WALKING_FALLS, help=f"and largest share of falls; {WALKING_FALLS} by default"
-    )
+    rmse = f"largest velocity RMSE of a robot that walks [m/s]; {WALKING_RMSE} by default"
+    parser.add_argument("--rmse", type=float, default=WALKING_RMSE, help=rmse)
+    falls = f"and largest share of falls; {WALKING_FALLS} by default"
+    parser.add_argument("--falls", type=float, default=WALKING_FALLS, help=falls)
     return parser
 
 
@@ -36,12 +31,9 @@ def build_parser() -> CommandParser:
 def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
-    check_limits(args.rmse, args.falls)
+    check_number("--rmse", args.rmse, 0, 100, above=True)
+    check_number("--falls", args.falls, 0, 1, above=True)
     if args.checkpoint is not None:
         raise ConfigError("--checkpoint: all checkpoints of the run are measured; leave it out")
     setting = settle(args)
-    check_follows_commands(setting.policy)
-    grid = grid_of(setting, args)
-    ready(setting)
-    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
-    return evaluate_all_checkpoints(policy, grid, setting.asked, device, graph, folder, args.rmse, args.falls)
+    return evaluate_all_checkpoints(setting, grid_of(setting, args), args.rmse, args.falls)

@@ -1,20 +1,17 @@
 """Arguments and set-up that the sub-commands of `legged evaluate` share."""
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from legged.commandline.arguments import add_policy_arguments, pick_device, policy_overrides, register_given, settle_on
-from legged.config import LeggedConfig, override
+from legged.config import LeggedConfig
 from legged.errors import ConfigError
+from legged.evaluation.measurement import Setting
 from legged.evaluation.result_file import CHANGED, changes_of
-from legged.evaluation.success import TYPES_HELP
 from legged.evaluation.velocity_grid import AXES, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
-from legged.physics import resolve_physics
-from legged.policies.restore import TrainedPolicy, policy_of
+from legged.policies.restore import policy_of
 from legged.process.command_parser import CommandParser
 from legged.process.paths import ready_to_write
 
@@ -22,31 +19,6 @@ ROBOTS = 16
 """Default number of robots for each cell of the grid."""
 MOST_SIZES = 16
 """Largest number of sizes of a terrain type that are measured at the same time."""
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A policy to measure, with its overrides and its folder."""
-
-    policy: TrainedPolicy
-    device: torch.device
-    graph: bool
-    overrides: list[tuple[str, Any]]
-    """Overrides of the command line."""
-    folder: Path
-    """Folder of the result."""
-    where: str
-    """The argument that names the engine, for errors."""
-
-    @property
-    def asked(self) -> list[tuple[str, Any]]:
-        """The overrides, with the engine of the device in place of the training's."""
-        return [("sim.physics", resolve_physics("auto", self.device)), *self.overrides]
-
-    @property
-    def judged(self) -> LeggedConfig:
-        """The policy's configuration with the overrides."""
-        return override(self.policy.cfg, self.overrides)  # type: ignore[return-value]
 
 
 def evaluation_parser(command: str, description: str | None, *examples: str) -> CommandParser:
@@ -75,13 +47,8 @@ def add_points_arguments(parser: argparse.ArgumentParser, full: str) -> None:
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
 
 
-def add_types_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --types, which chooses terrain types and sizes."""
-    parser.add_argument("--types", help=TYPES_HELP)
-
-
-def settle(args: argparse.Namespace) -> Setting:
-    """Return the setting of a command line.
+def settle(args: argparse.Namespace, follows: bool = True) -> Setting:
+    """Return the setting of a command line. If the evaluation `follows` commands, the policy must do so too.
 
     Raises:
         ConfigError: there is no such policy or device, or the folder cannot be written.
@@ -91,32 +58,15 @@ def settle(args: argparse.Namespace) -> Setting:
         raise ConfigError("--num-envs: the evaluation chooses the number of robots; leave it out")
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     settle_on(device)
-    policy = policy_of(args.policy, getattr(args, "checkpoint", None))
+    policy = policy_of(args.policy, args.checkpoint)
+    task = policy.cfg.task
+    if follows and not isinstance(policy.cfg, LeggedConfig):
+        raise ConfigError(f"POLICY: '{task}' has no velocity commands; legged evaluate episodes {task} measures its returns")
     overrides = policy_overrides(args)
     own = policy.output("evaluate")
     folder = args.out or (own / CHANGED if changes_of(overrides) else own)
-    where = "--physics" if args.physics else "sim.physics"
-    return Setting(policy, device, not args.no_graph, overrides, folder, where)
-
-
-def ready(setting: Setting) -> None:
-    """Check that the result can be written.
-
-    Raises:
-        ConfigError: it cannot.
-    """
-    ready_to_write(setting.folder)
-
-
-def check_follows_commands(policy: TrainedPolicy) -> None:
-    """Check that a policy's task has velocity commands.
-
-    Raises:
-        ConfigError: it has none.
-    """
-    if not isinstance(policy.cfg, LeggedConfig):
-        task = policy.cfg.task
-        raise ConfigError(f"POLICY: '{task}' has no velocity commands; legged evaluate episodes {task} measures its returns")
+    ready_to_write(folder)
+    return Setting(policy, device, folder, overrides, not args.no_graph, "--physics" if args.physics else "sim.physics")
 
 
 def grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
@@ -125,13 +75,11 @@ def grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
     Raises:
         ConfigError: an axis is malformed, or the grid is too large.
     """
-    axes = axes_of(setting.judged)
-    robots = ROBOTS
+    axes = axes_of(setting.cfg)
     if args is not None:
         texts = {axis: getattr(args, axis) for axis in AXES}
-        axes = {**axes, **{axis: axis_values(f"--{axis}", text) for axis, text in texts.items() if text is not None}}
-        robots = args.robots
-    grid = Grid(axes["vx"], axes["vy"], axes["yaw"], robots)
+        axes |= {axis: axis_values(f"--{axis}", text) for axis, text in texts.items() if text is not None}
+    grid = Grid(**axes, robots=ROBOTS if args is None else args.robots)
     check_size(grid)
     return grid
 
@@ -142,8 +90,17 @@ def check_points(given: int | None, full: bool) -> int:
     Raises:
         ConfigError: the number is below 1, or larger than any machine can hold.
     """
-    a_point = given if given is not None else (256 if full else 32)
-    if not 1 <= a_point <= MOST_ROBOTS // MOST_SIZES:
-        limit = "at least 1" if a_point < 1 else f"at most {MOST_ROBOTS // MOST_SIZES:,}"
-        raise ConfigError(f"--robots-per-point: must be {limit}, got {a_point:,}")
-    return a_point
+    check_number("--robots-per-point", given, 1, MOST_ROBOTS // MOST_SIZES)
+    return given if given is not None else 256 if full else 32
+
+
+def check_number(flag: str, value: float | None, least: float, most: float, above: bool = False) -> None:
+    """Check that a number of the command line, if it is given, is from `least`, or `above` it, to `most`.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if value is None or (least < value <= most) or (value == least and not above):
+        return
+    limit = f"at most {most:,}" if value > most else f"above {least:,}" if above else f"at least {least:,}"
+    raise ConfigError(f"{flag}: must be {limit}, got {value:,}")

@@ -4,7 +4,7 @@ It measures tasks without velocity commands, in one of the engines of this packa
 evaluation_<physics>.json.
 """
 
-from legged.cli.evaluate.common import evaluation_parser, ready, settle
+from legged.cli.evaluate.common import check_number, evaluation_parser, settle
 from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
@@ -27,26 +27,13 @@ def build_parser() -> CommandParser:
     return parser
 
 
-def check_episodes(count: int) -> None:
-    """Check the number of episodes.
-
-    Raises:
-        ConfigError: it is out of bounds.
-    """
-    if not 1 <= count <= MOST_EPISODES:
-        limit = "at least 1" if count < 1 else f"at most {MOST_EPISODES:,}"
-        raise ConfigError(f"--episodes: must be {limit}, got {count:,}")
-
-
 @command
 def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
-    check_episodes(args.episodes)
-    setting = settle(args)
-    task = setting.policy.cfg.task
+    check_number("--episodes", args.episodes, 1, MOST_EPISODES)
+    setting = settle(args, follows=False)
     if isinstance(setting.policy.cfg, LeggedConfig):
+        task = setting.policy.cfg.task
         raise ConfigError(f"POLICY: '{task}' follows velocity commands; legged evaluate grid {task} measures how well")
-    ready(setting)
-    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
-    return evaluate_episodes(policy, args.episodes, setting.asked, device, graph, folder, setting.where)
+    return evaluate_episodes(setting, args.episodes)

@@ -5,11 +5,10 @@ evaluation_<physics>.json and .png written. With `--physics all` the grid is mea
 crossing.json and .png are written.
 """
 
-from legged.cli.evaluate.common import add_grid_arguments, check_follows_commands, evaluation_parser, grid_of, ready, settle
+from legged.cli.evaluate.common import add_grid_arguments, evaluation_parser, grid_of, settle
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.crossing import EVERYWHERE, cross
-from legged.evaluation.following import evaluate_following
+from legged.evaluation.following import EVERYWHERE, cross, evaluate_following
 from legged.process.command_parser import CommandParser
 
 
@@ -35,10 +34,5 @@ def main(argv: list[str] | None) -> int:
         if args.solver is not None:
             raise ConfigError(f"--solver: --physics {EVERYWHERE} measures in all of them; leave one of the two out")
     setting = settle(args)
-    check_follows_commands(setting.policy)
     grid = grid_of(setting, args)
-    ready(setting)
-    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
-    if everywhere:
-        return cross(policy, grid, setting.overrides, device, graph, folder)
-    return evaluate_following(policy, grid, {}, 0, setting.asked, device, graph, folder, setting.where)
+    return cross(setting, grid) if everywhere else evaluate_following(setting, grid)

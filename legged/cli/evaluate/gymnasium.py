@@ -4,12 +4,14 @@ The exported policy acts in the environment that the task is modelled on, and Gy
 printed and written to evaluation_gymnasium.json.
 """
 
-from legged.cli.evaluate.common import evaluation_parser, ready, settle
-from legged.cli.evaluate.episodes import check_episodes
+from legged.cli.evaluate.common import check_number, evaluation_parser, settle
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.gymnasium_episodes import EPISODES, environment_of, evaluate_in_gymnasium
+from legged.evaluation.episodes import MOST_EPISODES, evaluate_in_gymnasium
 from legged.process.command_parser import CommandParser
+
+EPISODES = 20
+"""Default number of episodes."""
 
 
 def build_parser() -> CommandParser:
@@ -28,11 +30,8 @@ def build_parser() -> CommandParser:
 def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
-    check_episodes(args.episodes)
+    check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     for option in ("physics", "solver", "sim_device"):
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option.replace('_', '-')}: Gymnasium simulates by itself; leave it out")
-    setting = settle(args)
-    environment_of(setting.policy.cfg.task)
-    ready(setting)
-    return evaluate_in_gymnasium(setting.policy, args.episodes, setting.overrides, setting.folder)
+    return evaluate_in_gymnasium(settle(args, follows=False), args.episodes)

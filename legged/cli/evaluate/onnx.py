@@ -17,9 +17,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from legged.cli.evaluate.common import check_number
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
-from legged.evaluation.playback import SETTLING_S, Played, follow, play
+from legged.evaluation.playback import SETTLING_S, follow, play
+from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
@@ -108,17 +110,12 @@ def evaluate(argv: list[str] | None) -> int:
     if grid:
         result = _follow_all(robot, policies, files, args, grid)
     else:
-        played = [play(robot, policy, commands, seconds, args.friction) for policy in policies]
-        for path, rows in zip(files, played, strict=True):
+        said = []
+        for path, policy in zip(files, policies, strict=True):
+            rows = play(robot, policy, commands, seconds, args.friction)
             Console(width=100).print(_table(rows, path.name))
-        result = {
-            "robot": robot.name,
-            "friction": args.friction,
-            "seconds": seconds,
-            "policies": [
-                {"file": str(path), "commands": [_row(row) for row in rows]} for path, rows in zip(files, played, strict=True)
-            ],
-        }
+            said.append({"file": str(path), "commands": rows})
+        result = {"robot": robot.name, "friction": args.friction, "seconds": seconds, "policies": said}
     if args.out is not None:
         make_folder(args.out)
         write_text(args.out / RESULT, json.dumps(result, indent=1))
@@ -127,11 +124,7 @@ def evaluate(argv: list[str] | None) -> int:
 
 
 def _file(name: str) -> Path:
-    """Return the ONNX file that POLICY names.
-
-    Raises:
-        ConfigError: there is no such file.
-    """
+    """Return the ONNX file that POLICY names."""
     path = exported_file(name)
     if path is None or not exists(path) or not path.is_file():
         raise ConfigError(f"POLICY: there is no ONNX file '{name}', nor is it an exported folder (with {EXPORTED[0]})")
@@ -147,11 +140,7 @@ def _description(file: Path, first: Path) -> Path:
 
 
 def _command(text: str) -> tuple[float, ...]:
-    """Return vx, vy [m/s] and yaw rate [rad/s].
-
-    Raises:
-        ConfigError: the text is not three numbers.
-    """
+    """Return vx, vy [m/s] and yaw rate [rad/s]."""
     try:
         values = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -162,19 +151,14 @@ def _command(text: str) -> tuple[float, ...]:
 
 
 def _grid(args: argparse.Namespace) -> Grid | None:
-    """Return the grid of the command line; None without --vx, --vy and --yaw.
-
-    Raises:
-        ConfigError: the grid is malformed, or single commands are given too.
-    """
+    """Return the grid of the command line; None without --vx, --vy and --yaw."""
     if all(getattr(args, axis) is None for axis in AXES):
         if args.rmse is not None:
             raise ConfigError("--rmse: is a limit of a grid of commands; add --vx, --vy or --yaw")
         return None
     if args.command:
         raise ConfigError("--command: is not part of a grid; leave out either it or --vx, --vy and --yaw")
-    if args.rmse is not None and not 0.0 < args.rmse <= 100.0:
-        raise ConfigError(f"--rmse: must be above 0 and at most 100, got {args.rmse}")
+    check_number("--rmse", args.rmse, 0, 100, above=True)
     given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
     vx, vy, yaw = (axis_values(f"--{axis}", text) for axis, text in given.items())
     grid = Grid(vx, vy, yaw, robots=1, hold_s=HOLD_S if args.seconds is None else args.seconds)
@@ -190,14 +174,13 @@ def _follow_all(
     """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
     time come in its order.
     """
-    marks = [_marks(policy) for policy in policies]
-    order = sorted(range(len(policies)), key=lambda i: marks[i].get("wall_s", 0.0))
+    known = [(path, policy, _marks(policy)) for path, policy in zip(files, policies, strict=True)]
     heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")
     print(f"{robot.name}: {grid.num_cells} commands, {grid.hold_s:g} s each; errors in m/s and rad/s")
     print("".join(f"{head:>15}" for head in heads) + "  file", flush=True)
     rows: list[dict[str, Any]] = []
-    for i in order:
-        row = {"file": str(files[i]), **marks[i], **follow(robot, policies[i], grid, args.friction)}
+    for path, policy, marks in sorted(known, key=lambda one: one[2].get("wall_s", 0.0)):
+        row = {"file": str(path), **marks, **follow(robot, policy, grid, args.friction)}
         rows.append(row)
         errors = [row[name][part] for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")]
         figures = [f"{row['wall_s']:.1f}" if "wall_s" in row else "-"]
@@ -214,15 +197,11 @@ def _follow_all(
     }
     if args.rmse is None:
         return result
-    first = next((row for row in rows if _follows(row, args.rmse)), None)
+    ended = (row for row in rows if row["falls"] == 0.0 and row["rmse_lin"]["mean"] is not None)
+    first = next((row for row in ended if row["rmse_lin"]["mean"] <= args.rmse), None)
     when = f" after {first['wall_s']:.1f} s of training" if first and "wall_s" in first else ""
     print(f"velocity RMSE <= {args.rmse:g} m/s without a fall: {first['file'] + when if first else 'none'}")
     return {**result, "rmse": args.rmse, "first": first and {k: v for k, v in first.items() if k != "cells"}}
-
-
-def _follows(row: dict[str, Any], rmse: float) -> bool:
-    mean = row["rmse_lin"]["mean"]
-    return row["falls"] == 0.0 and mean is not None and mean <= rmse
 
 
 def _marks(policy: ForeignPolicy) -> dict[str, float]:
@@ -236,18 +215,14 @@ def _marks(policy: ForeignPolicy) -> dict[str, float]:
     return found
 
 
-def _row(row: Played) -> dict[str, Any]:
-    """Return a command's figures for JSON, with null for undefined ones."""
-    velocity = None if row.fell_after is not None else list(row.velocity)
-    height = None if velocity is None else row.height
-    return {"command": list(row.command), "velocity": velocity, "lowest_base": height, "fell_after": row.fell_after}
+def _table(rows: list[dict[str, Any]], name: str) -> Table:
+    def text(values: list[float] | None) -> str:
+        return "-" if values is None else " ".join(f"{value:6.2f}" for value in values)
 
-
-def _table(rows: list[Played], name: str) -> Table:
-    table = Table(title=f"{name}: velocities after {SETTLING_S:g} s, base frame [m/s, m/s, rad/s]")
-    for heading in ("command", "reached", "lowest base [m]", "fell after"):
-        table.add_column(heading, justify="right")
+    lines = []
     for row in rows:
-        command, reached = (" ".join(f"{value:6.2f}" for value in values) for values in (row.command, row.velocity))
-        table.add_row(command, reached, f"{row.height:.3f}", "-" if row.fell_after is None else f"{row.fell_after:.2f} s")
-    return table
+        height, fell_after = row["lowest_base"], row["fell_after"]
+        ends = ("-" if height is None else f"{height:.3f}", "-" if fell_after is None else f"{fell_after:.2f} s")
+        lines.append([text(row["command"]), text(row["velocity"]), *ends])
+    title = f"{name}: velocities after {SETTLING_S:g} s, base frame [m/s, m/s, rad/s]"
+    return screen_table(title, ("command", "reached", "lowest base [m]", "fell after"), lines, left=())

@@ -10,7 +10,7 @@ The tables are printed; evaluation_<physics>.json and pictures are written besid
 import argparse
 
 from legged.cli.evaluate import onnx
-from legged.cli.evaluate.common import check_points, evaluation_parser, grid_of, ready, settle
+from legged.cli.evaluate.common import check_points, evaluation_parser, grid_of, settle
 from legged.cli.evaluate.episodes import ENVIRONMENTS
 from legged.cli.main import hint_at_sub_command
 from legged.commandline.command import command
@@ -37,25 +37,16 @@ def main(argv: list[str] | None) -> int:
         _check_plain(args)
         return onnx.evaluate([args.policy, *(["--out", str(args.out)] if args.out else [])])
     with hint_at_sub_command("evaluate", [args.policy]):
-        setting = settle(args)
-    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
-    if not isinstance(policy.cfg, LeggedConfig):
-        ready(setting)
-        return evaluate_episodes(policy, ENVIRONMENTS, setting.asked, device, graph, folder, setting.where)
-    grid = grid_of(setting)
-    sizes = chosen_sizes(policy.cfg, None, False, setting.judged.terrain.scale)
-    ready(setting)
-    return evaluate_following(
-        policy, grid, sizes, check_points(None, False), setting.asked, device, graph, folder, setting.where
-    )
+        setting = settle(args, follows=False)
+    cfg = setting.policy.cfg
+    if not isinstance(cfg, LeggedConfig):
+        return evaluate_episodes(setting, ENVIRONMENTS)
+    sizes = chosen_sizes(cfg, None, False, setting.cfg.terrain.scale)
+    return evaluate_following(setting, grid_of(setting), sizes, check_points(None, False))
 
 
 def _check_plain(args: argparse.Namespace) -> None:
-    """Check that no option is given that has no effect on an ONNX file, which runs in C MuJoCo unchanged.
-
-    Raises:
-        ConfigError: there is such an option.
-    """
+    """Check that no option is given that has no effect on an ONNX file, which runs in C MuJoCo unchanged."""
     if args.overrides:
         raise ConfigError(f"{args.overrides[0]}: an ONNX file runs as it is; `legged evaluate onnx` has its options")
     plain = vars(build_parser().parse_args([args.policy]))

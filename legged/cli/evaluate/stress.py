@@ -5,21 +5,11 @@ settings, on stairs and on the flat. The share of robots that succeed is printed
 .png.
 """
 
-import argparse
-
-from legged.cli.evaluate.common import (
-    add_points_arguments,
-    check_follows_commands,
-    check_points,
-    evaluation_parser,
-    ready,
-    settle,
-)
+from legged.cli.evaluate.common import add_points_arguments, check_points, evaluation_parser, settle
 from legged.commandline.command import command
 from legged.errors import ConfigError, suggest
-from legged.evaluation.stress.measuring import RISER, TREAD, Wish
-from legged.evaluation.stress.report import evaluate_stress
-from legged.evaluation.stress.table import NAMES
+from legged.evaluation.stress.disturbances import NAMES
+from legged.evaluation.stress.measuring import RISER, TREAD, Bench, evaluate_stress
 from legged.process.command_parser import CommandParser
 
 LIMITS = {"riser": (0.0, 1.0, "m"), "tread": (0.05, 2.0, "m"), "payload": (0.0, 1000.0, "kg")}
@@ -47,35 +37,12 @@ def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_intermixed_args(argv)
     robots = check_points(args.robots_per_point, args.full)
-    wish = _wish(args)
-    setting = settle(args)
-    check_follows_commands(setting.policy)
-    ready(setting)
-    policy, device, graph, folder = setting.policy, setting.device, setting.graph, setting.folder
-    return evaluate_stress(policy, robots, args.full, wish, setting.asked, device, graph, folder, setting.where)
-
-
-def _wish(args: argparse.Namespace) -> Wish:
-    """Return the lines and sizes of the table.
-
-    Raises:
-        ConfigError: a number is out of bounds, or there is no such line.
-    """
     for option, (low, high, unit) in LIMITS.items():
         value = getattr(args, option)
         if value is not None and not low <= value <= high:
             raise ConfigError(f"--{option}: must be between {low:g} and {high:g} {unit}, got {value:g}")
-    return Wish(args.riser, args.tread, args.payload, stress_lines(args.lines))
-
-
-def stress_lines(text: str | None) -> tuple[str, ...]:
-    """Return the names in the comma-separated list of --lines.
-
-    Raises:
-        ConfigError: there is no such line.
-    """
-    names = tuple(name.strip() for name in text.split(",")) if text is not None else ()
-    for name in names:
+    lines = [name.strip() for name in args.lines.split(",")] if args.lines is not None else []
+    for name in lines:
         if name not in NAMES:
             raise ConfigError(f"--lines: there is no line '{name}'{suggest(name, NAMES)}")
-    return names
+    return evaluate_stress(Bench(settle(args), robots, args.riser, args.tread, args.payload, lines), args.full)

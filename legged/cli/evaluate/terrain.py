@@ -4,20 +4,11 @@ Robots cross tiles of each terrain type in growing sizes. The share of robots th
 success_<physics>.png, and written into evaluation_<physics>.json.
 """
 
-from legged.cli.evaluate.common import (
-    add_points_arguments,
-    add_types_argument,
-    check_follows_commands,
-    check_points,
-    evaluation_parser,
-    ready,
-    settle,
-)
+from legged.cli.evaluate.common import add_points_arguments, check_points, evaluation_parser, settle
 from legged.commandline.command import command
-from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.evaluation.following import evaluate_following
-from legged.evaluation.success import chosen_sizes
+from legged.evaluation.success import TYPES_HELP, chosen_sizes
 from legged.process.command_parser import CommandParser
 
 
@@ -29,7 +20,7 @@ def build_parser() -> CommandParser:
         "legged evaluate terrain anymal_c --physics mujoco",
         "legged evaluate terrain go2 --types stairs_up,slope_up --robots-per-point 64",
     )
-    add_types_argument(parser)
+    parser.add_argument("--types", help=TYPES_HELP)
     add_points_arguments(parser, "all sizes of a type")
     return parser
 
@@ -40,14 +31,10 @@ def main(argv: list[str] | None) -> int:
     args = build_parser().parse_intermixed_args(argv)
     robots = check_points(args.robots_per_point, args.full)
     setting = settle(args)
-    policy = setting.policy
-    check_follows_commands(policy)
-    assert isinstance(policy.cfg, LeggedConfig)
-    sizes = chosen_sizes(policy.cfg, args.types, args.full, setting.judged.terrain.scale)
+    cfg = setting.policy.cfg
+    sizes = chosen_sizes(cfg, args.types, args.full, setting.cfg.terrain.scale)  # type: ignore[arg-type]
     if not sizes:
-        task = policy.cfg.task
-        raise ConfigError(f"POLICY: '{task}' was trained on a plane; --types names the terrain types that it should cross")
-    ready(setting)
-    return evaluate_following(
-        policy, None, sizes, robots, setting.asked, setting.device, setting.graph, setting.folder, setting.where
-    )
+        raise ConfigError(
+            f"POLICY: '{cfg.task}' was trained on a plane; --types names the terrain types that it should cross"
+        )
+    return evaluate_following(setting, None, sizes, robots)

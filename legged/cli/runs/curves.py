@@ -7,30 +7,26 @@ the picture also shows the mean level of each type, and the shares of episodes a
 
 from pathlib import Path
 
+from legged.cli.runs import folders_of, runs_parser
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.learning_curves import Log, common_time, labels, read_config, read_scalars
+from legged.evaluation.learning_curves import Log, common_time, labels, levels, outcomes, read_config, read_scalars
 from legged.evaluation.reports.charts import draw_charts
-from legged.evaluation.reports.curves import levels, outcomes
-from legged.learning.run_folder import own_run
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative
-from legged.registry import import_tasks
 
 PICTURE = "learning_curve.png"
 
 
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged runs curves",
+    parser = runs_parser(
+        "curves",
         __doc__,
         "legged runs curves anymal_c_flat/2026-11-22_05-38-19",
         "legged runs curves logs/anymal_c/*_s1 logs/anymal_c/*_s2 --out pictures",
     )
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or tasks, whose newest runs count")
     parser.add_argument("--out", type=Path, default=Path("."), help=f"folder for {PICTURE}; the working directory by default")
-    add_import_argument(parser)
     return parser
 
 
@@ -38,9 +34,7 @@ def build_parser() -> CommandParser:
 def main(argv: list[str] | None) -> int:
     """Run the command; return its exit code."""
     args = build_parser().parse_args(argv)
-    if args.module:
-        import_tasks(args.module)
-    folders = [own_run(name, "RUN") for name in args.runs]
+    folders = folders_of(args)
     ready_to_write(args.out)
     logs = [Log(read_scalars(run), read_config(run)) for run in folders]
     runs = list(zip(labels(folders, [log.config for log in logs]), logs, strict=True))

@@ -10,16 +10,17 @@ from rich.console import Console
 
 from legged.commandline.command import command
 from legged.errors import ConfigError
-from legged.evaluation.comparison import (
+from legged.evaluation.reports.comparison import (
+    Evaluations,
     draw_comparison,
     episodes_comparison,
     grouped,
     keep_types,
     success_table,
     tracking_table,
-    types_of,
 )
 from legged.evaluation.result_file import has_tracking, read_results
+from legged.evaluation.success import types_in
 from legged.process.command_parser import CommandParser
 from legged.process.paths import make_folder, ready_to_write, relative
 
@@ -49,22 +50,20 @@ def main(argv: list[str] | None) -> int:
     results = read_results(args.paths)
     if args.types:
         keep_types(results, [name.strip() for name in args.types.split(",")])
-    groups = grouped(results)
-    episodes = {key: results for key, results in groups.items() if all("episodes" in result for result in results)}
-    following = {key: results for key, results in groups.items() if not any("episodes" in result for result in results)}
-    for task, physics, _ in groups.keys() - episodes.keys() - following.keys():
-        raise ConfigError(f"{task} in {physics}: some evaluations are of commands, others of episodes; compare them apart")
+    episodes: Evaluations = {}
+    following: Evaluations = {}
+    for key, seeds in grouped(results).items():
+        of_episodes = {"episodes" in result for result in seeds}
+        if len(of_episodes) > 1:
+            told = "some evaluations are of commands, others of episodes; compare them apart"
+            raise ConfigError(f"{key[0]} in {key[1]}: {told}")
+        (episodes if of_episodes.pop() else following)[key] = seeds
+    tracked = {key: seeds for key, seeds in following.items() if any(map(has_tracking, seeds))}
+    with_success = {key: seeds for key, seeds in following.items() if any(map(types_in, seeds))}
     console = Console(width=130)
-    tracked = {key: results for key, results in following.items() if any(map(has_tracking, results))}
-    if tracked:
-        console.print(tracking_table(tracked))
-    if episodes:
-        console.print(episodes_comparison(episodes))
-    with_success = {key: results for key, results in following.items() if any("success" in result for result in results)}
-    if not types_of(with_success):
-        with_success = {}
-    if with_success:
-        console.print(success_table(with_success))
+    for groups, table in ((tracked, tracking_table), (episodes, episodes_comparison), (with_success, success_table)):
+        if groups:
+            console.print(table(groups))
     if args.out:
         if not with_success:
             raise ConfigError("--out: draws success against difficulty, and none of the evaluations holds that")

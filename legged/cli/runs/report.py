@@ -10,18 +10,18 @@ from pathlib import Path
 
 import torch
 
+from legged.cli.runs import folders_of, runs_parser
 from legged.commandline.arguments import add_checkpoint_argument
 from legged.commandline.command import command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import FILMS, read_record
 from legged.evaluation.reports.run_report import command_on, write_report
-from legged.learning.run_folder import CONFIG_FILE, NOTE_FILE, find_checkpoint, own_run, run_config
+from legged.learning.run_folder import CONFIG_FILE, NOTE_FILE, find_checkpoint, run_config
 from legged.play.walking_film import film, write_film
 from legged.policies.restore import TrainedPolicy
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, ready_to_write, relative, write_text
-from legged.registry import import_tasks
 
 SIDE = 320
 """Width and height of the film [pixels]."""
@@ -32,15 +32,13 @@ LONGEST_NOTE = 1000
 
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged runs report",
+    parser = runs_parser(
+        "report",
         __doc__,
         "legged runs report anymal_c_flat/2026-11-22_05-38-19",
         "legged runs report anymal_c_flat --film",
     )
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or a task, whose newest run counts")
     add_checkpoint_argument(parser)
-    add_import_argument(parser)
     parser.add_argument("--film", action="store_true", help=f"film the policy again, into {FILMS[0]}")
     parser.add_argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}")
     return parser
@@ -52,11 +50,12 @@ def main(argv: list[str] | None) -> int:
     args = build_parser().parse_args(argv)
     if args.checkpoint is not None and not args.film:
         raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
-    if args.module:
-        import_tasks(args.module)
-    folders = [own_run(name, "RUN") for name in args.runs]
-    if args.note is not None:
-        write_note(folders, args.note)
+    folders = folders_of(args)
+    note = " ".join((args.note or "").split())
+    if args.note is not None and not 0 < len(note) <= LONGEST_NOTE:
+        raise ConfigError(f"--note: expected a sentence of at most {LONGEST_NOTE} letters, got {len(note)}")
+    for folder in folders if note else ():
+        write_text(folder / NOTE_FILE, f"{note}\n")
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
@@ -69,19 +68,6 @@ def main(argv: list[str] | None) -> int:
     return 0
 
 
-def write_note(folders: list[Path], text: str) -> None:
-    """Write a sentence into run folders.
-
-    Raises:
-        ConfigError: the sentence is empty or too long.
-        RunError: a file can't be written.
-    """
-    if not text.strip() or len(text) > LONGEST_NOTE:
-        raise ConfigError(f"--note: expected a sentence of at most {LONGEST_NOTE} letters, got {len(text.strip())}")
-    for folder in folders:
-        write_text(folder / NOTE_FILE, " ".join(text.split()) + "\n")
-
-
 def _film(folder: Path, checkpoint: int | str | None) -> str:
     """Film the policy of a run; return the reason if that is impossible, else an empty text."""
     try:
@@ -90,8 +76,7 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
             command = command_on(read_record(folder), "play")
             return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
         torch.set_num_threads(1)
-        policy = TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
-        pictures = film(policy, SIDE)
+        pictures = film(TrainedPolicy(cfg, find_checkpoint(folder, checkpoint)), SIDE)
         if not exists(folder / CONFIG_FILE):
             return "the run folder was removed"
         write_film(pictures, folder / FILMS[0])

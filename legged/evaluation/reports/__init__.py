@@ -1,1 +1,21 @@
-"""Reports on runs: a page on one training, a table of many, a comparison of several; as HTML and as Markdown."""
+"""Pages and drawings about runs and their evaluations."""
+
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+@cache
+def _templates() -> "Environment":
+    from jinja2 import Environment, PackageLoader  # takes a while
+
+    return Environment(loader=PackageLoader(__name__), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+
+
+def render(template: str, **values: Any) -> str:
+    """Return a page or a drawing from a template in the folder templates/; texts are escaped. A page holds its style and its
+    script, and its content security policy lets it load nothing else.
+    """
+    return _templates().get_template(template).render(values)

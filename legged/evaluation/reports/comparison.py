@@ -1,25 +1,199 @@
-"""A comparison of runs: differing settings, curves, and evaluations with intervals."""
+"""Comparisons: evaluations in tables for the screen, and runs on a page with settings, curves and evaluations. On the screen
+the evaluations of one task in one engine under one condition are its seeds.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from math import sqrt
+from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import numpy as np
+from rich.table import Table as ScreenTable
 
-from legged.config.dotted import differences
-from legged.evaluation.engines import ENGINES, engine_of
+from legged.config.dotted import differences, value_at
+from legged.errors import ConfigError, suggest
+from legged.evaluation.engines import engine_of, in_order
 from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
-from legged.evaluation.learning_curves import labels
-from legged.evaluation.reports.charts import curves
-from legged.evaluation.reports.curves import curves_of_runs
-from legged.evaluation.reports.document import Cell, Figures, Heading, Mono, Paragraph, Part, Table
-from legged.evaluation.reports.evaluation_part import BROKEN, between, falls_of, number
+from legged.evaluation.learning_curves import curves_of_runs, labels
+from legged.evaluation.reports.charts import Line, curves, draw_charts
+from legged.evaluation.reports.document import (
+    Cell,
+    Figures,
+    Heading,
+    Mono,
+    Paragraph,
+    Part,
+    Table,
+    between,
+    number,
+)
 from legged.evaluation.reports.record import Record, words
-from legged.evaluation.result_file import changes_text, grid_text, tracking_of
-from legged.evaluation.success_report import success_chart, success_line, types_in
+from legged.evaluation.result_file import BROKEN, changes_text, falls_of, grid_text, has_tracking, tracking_of
+from legged.evaluation.success import success_chart, success_line, types_in
+from legged.evaluation.tables import screen_table
 
-Measured = tuple[str, Interval | None] | None
-"""Text of a figure and its interval, if it has one; None if a run lacks the figure."""
+Key = tuple[str, str, str]
+"""Task, engine, and conditions that differ from the policy's own or between evaluations."""
+Evaluations = dict[Key, list[dict[str, Any]]]
+"""Key -> results, one a seed."""
+FIGURES = {
+    "velocity RMSE, mean [m/s]": ("rmse_lin.mean", 1.0, ".3f"),
+    "velocity RMSE, worst cell [m/s]": ("rmse_lin.worst", 1.0, ".3f"),
+    "yaw rate RMSE, mean [rad/s]": ("rmse_ang.mean", 1.0, ".3f"),
+    "yaw rate RMSE, worst cell [rad/s]": ("rmse_ang.worst", 1.0, ".3f"),
+    "falls [%]": ("falls", 100.0, ".2f"),
+}
+"""Label -> path in a result, factor, format."""
+Counted = dict[tuple[float, ...], float] | tuple[float, float, int] | tuple[int, int] | float | None
+"""A figure of a run: errors by command; mean, sample standard deviation and number; successes and trials; a bare number."""
+Measured = tuple[float, Interval | None] | None
+"""A figure and its interval, if it has one; None if a run lacks the figure."""
+
+
+def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
+    """Remove all terrain types but `types` from the results, and order them so.
+
+    Raises:
+        ConfigError: no result has a type.
+    """
+    there = {name for result in results for name in types_in(result)}
+    for name in types:
+        if name not in there:
+            raise ConfigError(f"--types: {name}: none of the evaluations holds it{suggest(name, there)}")
+    for result in results:
+        if "success" in result:
+            found = result["success"]["types"]
+            result["success"]["types"] = {name: found[name] for name in types if name in found}
+
+
+def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
+    """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of their
+    first.
+    """
+    grids = [grid_text(result) for result in results]
+    told = len(set(grids) - {""}) > 1
+    groups: Evaluations = {}
+    for result, grid in zip(results, grids, strict=True):
+        conditions = ", ".join(text for text in (changes_text(result), grid if told else "") if text)
+        groups.setdefault((result["task"], result["physics"], conditions), []).append(result)
+    return groups
+
+
+def spread(values: Sequence[float]) -> float:
+    """Return the largest distance of a value from the mean, as a share of the mean; 0 if all values are 0."""
+    middle = mean(values)
+    return max(abs(value - middle) for value in values) / middle if middle else 0.0
+
+
+def tracking_table(groups: Evaluations) -> ScreenTable:
+    """Return a table with a column a group: the mean over its seeds and the farthest seed's distance from it."""
+    rows = []
+    for label, (path, factor, form) in FIGURES.items():
+        row = [label]
+        for results in groups.values():
+            found = [value_at(tracking_of(result), path) for result in results if has_tracking(result)]
+            values = [factor * value for value in found if value is not None]  # null if every robot fell
+            row.append(_mean_text(values, len(results), form, f"{100 * spread(values):.0f} %") if values else "none")
+        rows.append(row)
+    return screen_table("following commands: mean of seeds (farthest from it)", ["measure", *_heads(groups)], rows)
+
+
+def episodes_comparison(groups: Evaluations) -> ScreenTable:
+    """Return a table of evaluations of episodes with a column a group: the mean over its seeds and their range."""
+    found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
+    rows = []
+    for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
+        row = [label]
+        for seeds in found:
+            values = [seed[label] for seed in seeds if label in seed]
+            form = ".1f" if values and abs(mean(values)) >= 100 else ".2f"
+            row.append(_range_text(values, len(values), form, form))
+        rows.append(row)
+    return screen_table("episodes: mean of seeds (lowest to highest)", ["measure", *_heads(groups)], rows)
+
+
+def _heads(groups: Evaluations) -> list[str]:
+    return [heading(key, len(results)) for key, results in groups.items()]
+
+
+def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
+    """Return a mean; in brackets the spread of several values, and their number if not all seeds have one."""
+    notes = [spread_text] if len(values) > 1 else []
+    notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
+    return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
+
+
+def _range_text(values: Sequence[float], seeds: int, form: str, range_form: str) -> str:
+    """Return a mean with the range of the values; an empty text without values."""
+    return _mean_text(values, seeds, form, f"{min(values):{range_form}} to {max(values):{range_form}}") if values else ""
+
+
+def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
+    """Return label -> number of the compared figures of an evaluation of episodes."""
+    return {
+        "return": episodes["return"]["mean"],
+        "standard deviation of the return": episodes["return"]["std"],
+        "least return": episodes["return"]["min"],
+        "episode length [steps]": episodes["length"]["mean"],
+        "episodes that ended in a failure [%]": 100.0 * episodes["failures"],
+        **{f"return of {name}": value for name, value in episodes["terms"].items()},
+        **episodes["metrics"],
+    }
+
+
+def heading(key: Key, seeds: int) -> str:
+    """Return the heading of a group."""
+    task, physics, conditions = key
+    text = f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
+    return f"{text}\n{conditions}" if conditions else text
+
+
+def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
+    """Return size -> success of every seed that was measured on a type, for the sizes that all of them have."""
+    entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
+    found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
+    common = set.intersection(*(set(one) for one in found)) if found else set()
+    return {size: [one[size] for one in found] for size in sorted(common)}
+
+
+def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
+    """Return terrain type -> one of its entries, for all types that were measured."""
+    entries = [types_in(result) for results in groups.values() for result in results]
+    return {name: entry for one in entries for name, entry in one.items()}
+
+
+def success_table(groups: Evaluations) -> ScreenTable:
+    """Return a table with a line a type and size: the mean success over seeds and their range."""
+    rows: list[list[str] | None] = []
+    for name, entry in types_of(groups).items():
+        columns = [(shares(results, name), len(results)) for results in groups.values()]
+        for i, size in enumerate(sorted(set().union(*(found for found, _ in columns)))):
+            percent = [([100 * value for value in found.get(size, [])], seeds) for found, seeds in columns]
+            cells = [_range_text(values, seeds, ".1f", ".0f") for values, seeds in percent]
+            rows.append([name if i == 0 else "", f"{size:g} {entry['unit']}", *cells])
+        rows.append(None)
+    return screen_table("success [%]: mean of seeds (lowest to highest)", ["terrain", "size", *_heads(groups)], rows)
+
+
+def draw_comparison(groups: Evaluations, path: Path) -> None:
+    """Draw success into a PNG file: a panel a terrain type, a line a group, with a band from the worst to the best seed."""
+    charts = []
+    for name in types_of(groups):
+        lines = []
+        for key, results in groups.items():
+            found, entries = shares(results, name), [types_in(result)[name] for result in results if name in types_in(result)]
+            if found:
+                worst, middle, best = (np.array([of(values) for values in found.values()]) for of in (min, mean, max))
+                label = heading(key, sum("success" in result for result in results))
+                lines.append((entries[0], Line(label, np.array(list(found)), middle, (worst, best), markers=True)))
+        if lines:
+            charts.append(success_chart(name.replace("_", " "), lines))
+    draw_charts(charts, path)
+
+
+# ---- the page on runs ------------------------------------------------------------------------------------------------
 
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
@@ -34,7 +208,10 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
         rows.append([*row, record.code.summary, *([record.note] if noted else [])])
     head = ["run", "folder", "status", "", "robots", "loop [s]", "steps/s", "commit", *(["note"] if noted else [])]
     parts: list[Part] = [Paragraph(f"All runs: {common}.")] if common else []
-    parts += [Table(head, rows), Heading("Settings that differ"), _settings(names, records)]
+    found = differences([record.config for record in records])
+    settings: list[list[Cell]] = [[Mono(path), *(Mono(words(value)) for value in values)] for path, values in found.items()]
+    told = Table(["setting", *names], settings) if settings else Paragraph("None.")
+    parts += [Table(head, rows), Heading("Settings that differ"), told]
     drawings = curves_of_runs([(name, record.log) for name, record in zip(names, records, strict=True)])
     if drawings:
         parts += [Heading("Curves"), Figures("curves", drawings, "learning curves of the runs")]
@@ -49,21 +226,11 @@ def apart(names: Sequence[str]) -> tuple[str, list[str]]:
     return (", ".join(common), rest) if all(rest) else ("", list(names))
 
 
-def _settings(names: Sequence[str], records: Sequence[Record]) -> Part:
-    """Return a table of the settings that are not the same in all runs."""
-    found = differences([record.config for record in records])
-    if not found:
-        return Paragraph("None.")
-    rows: list[list[Cell]] = [[Mono(path), *(Mono(words(value)) for value in values)] for path, values in found.items()]
-    return Table(["setting", *names], rows)
-
-
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
     """Return tables and drawings of the engines in which at least two runs were evaluated."""
     by_engine = [{result["physics"]: result for result in record.results} for record in records]
-    engines = dict.fromkeys(name for one in by_engine for name in one)
     parts: list[Part] = []
-    for engine in sorted(engines, key=lambda name: [*ENGINES, name].index(name)):
+    for engine in in_order(dict.fromkeys(name for one in by_engine for name in one)):
         results = [one.get(engine) for one in by_engine]
         if sum(result is not None for result in results) < 2:
             continue
@@ -71,7 +238,12 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
         parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
         parts += [Paragraph(f"{name}: {text}.") for name, text in zip(names, conditions_of(results), strict=True) if text]
-        drawings = _success(names, results)
+        drawings = []
+        entries = [(name, types_in(result or {})) for name, result in zip(names, results, strict=True)]
+        for kind in dict.fromkeys(kind for _, one in entries for kind in one):
+            there = [(one[kind], success_line(name, one[kind])) for name, one in entries if kind in one]
+            if len(there) > 1:
+                drawings.append(curves(success_chart(kind.replace("_", " "), there)))
         if drawings:
             parts.append(Figures(f"success_{engine}", drawings, f"success over difficulty in {engine_of(engine).label}"))
     if not parts:
@@ -86,10 +258,8 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
 
 def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
     """Return for each evaluation its changed fields, and its grid of commands if the grids differ."""
-    found = [result or {} for result in results]
-    grids = [grid_text(one) for one in found]
+    changes, grids = ([text(result or {}) for result in results] for text in (changes_text, grid_text))
     told = len(set(grids) - {""}) > 1
-    changes = [changes_text(one) for one in found]
     return [
         "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if told and grid else [])])
         for changed, grid in zip(changes, grids, strict=True)
@@ -98,119 +268,80 @@ def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:
     """Return the table of one engine: a line a measure, a column a run, and one for each difference from the first run."""
+    measures: dict[str, tuple[Callable[[dict[str, Any]], Counted], str, float]] = {
+        "velocity RMSE [m/s]": (partial(_errors, "rmse_lin"), ".3f", 1.0),
+        "yaw rate RMSE [rad/s]": (partial(_errors, "rmse_ang"), ".3f", 1.0),
+        "falls [%]": (lambda result: falls_of(tracking_of(result)), ".2f", 100.0),
+    }
+    if any("episodes" in (result or {}) for result in results):
+        measures = {"return": (_returns, ".1f", 1.0), "episodes that ended in a failure [%]": (_failures, ".2f", 100.0)}
     rows: list[list[Cell]] = []
-    for label, measure, difference in _measures(results):
-        found = [measure(result) if result is not None else None for result in results]
-        row: list[Cell] = [label, *(_words(one) for one in found)]
-        for result in results[1:]:
-            both = results[0] is not None and result is not None
-            row.append(_words(difference(results[0], result) if both else None, marked=True))
+    for label, (read, form, factor) in measures.items():
+        found = [None if result is None else read(result) for result in results]
+        row: list[Cell] = [label, *(_text(_figure(one), form, factor) for one in found)]
+        for one in found[1:]:
+            more = _difference(found[0], one)
+            clear = more is not None and more[1] is not None and not more[1][0] <= 0.0 <= more[1][1]
+            row.append(_text(more, f"+{form}", factor) + " *" * clear)
         rows.append(row)
     return Table(["measure", *names, *(f"{name} - {names[0]}" for name in names[1:])], rows)
 
 
-def _words(found: Measured, marked: bool = False) -> str:
-    if found is None:
-        return "-"
-    text, interval = found
-    return f"{text}{' *' if marked and interval is not None and not interval[0] <= 0.0 <= interval[1] else ''}"
-
-
-def _with_interval(value: float, form: str, interval: Interval | None, factor: float = 1.0) -> Measured:
+def _text(measured: Measured, form: str, factor: float) -> str:
     """Return a figure with its interval in brackets."""
-    around = "" if interval is None else f" ({between(interval, factor, form)})"
-    return f"{factor * value:{form}}{around}", interval
+    if measured is None:
+        return "-"
+    value, interval = measured
+    return f"{factor * value:{form}}" + ("" if interval is None else f" ({between(interval, factor, form)})")
 
 
-def _measures(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, Any, Any]]:
-    """Return the compared measures: label, figure of a run, and difference of two."""
-    if any(result is not None and "episodes" in result for result in results):
-        return [
-            ("return", *_figure(_spread, lambda mean, _std, _count: mean, normal_mean, welch, ".1f")),
-            ("episodes that ended in a failure [%]", *_share(_failures)),
-        ]
-    return [
-        ("velocity RMSE [m/s]", *_error("rmse_lin")),
-        ("yaw rate RMSE [rad/s]", *_error("rmse_ang")),
-        ("falls [%]", *_share(lambda result: falls_of(tracking_of(result)))),
-    ]
-
-
-def _error(name: str) -> tuple[Any, Any]:
-    """Return functions for the mean of an error over the grid, and for the difference of two on the same grid."""
-
-    def cells(result: dict[str, Any]) -> dict[tuple[float, ...], float]:
-        try:
-            found = tracking_of(result)["cells"]
-            return {tuple(cell["command"]): float(cell[name]) for cell in found if cell[name] is not None}
-        except BROKEN:
-            return {}
-
-    def of(result: dict[str, Any]) -> Measured:
-        values = list(cells(result).values())
-        if not values:
-            mean = tracking_of(result).get(name, {}).get("mean")
-            return None if mean is None else (f"{mean:.3f}", None)
-        return _with_interval(float(np.mean(values)), ".3f", bootstrap_mean(values))
-
-    def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
-        a, b = cells(first), cells(second)
-        common = [command for command in a if command in b]
-        if not common:
+def _figure(found: Counted) -> Measured:
+    match found:
+        case dict():
+            return float(np.mean(list(found.values()))), bootstrap_mean(list(found.values()))
+        case (successes, trials):
+            return successes / trials, wilson(successes, trials)
+        case (middle, std, count):
+            return middle, normal_mean(middle, std, count)
+        case None:
             return None
-        moved = [b[command] - a[command] for command in common]
-        return _with_interval(float(np.mean(moved)), "+.3f", bootstrap_mean(moved))
-
-    return of, more
+    return found, None
 
 
-def _figure(read: Any, value: Any, interval: Any, of_difference: Any, form: str, factor: float = 1.0) -> tuple[Any, Any]:
-    """Return functions for a figure and for the difference of two. `read` finds values in a result, or None; `value` and
-    `interval` compute the figure and its interval from them, `of_difference` the interval of a difference.
-    """
-
-    def of(result: dict[str, Any]) -> Measured:
-        found = read(result)
-        if found is None:
-            return None
-        return _with_interval(value(*found), form, interval(*found), factor)
-
-    def more(first: dict[str, Any], second: dict[str, Any]) -> Measured:
-        a, b = read(first), read(second)
-        if a is None or b is None:
-            return None
-        return _with_interval(value(*b) - value(*a), f"+{form}", of_difference(a, b), factor)
-
-    return of, more
+def _difference(first: Counted, second: Counted) -> Measured:
+    """Return the difference second - first; of errors, that over the commands of both."""
+    match first, second:
+        case dict(), dict():
+            moved = {command: second[command] - error for command, error in first.items() if command in second}
+            return _figure(moved) if moved else None
+        case (some, of_first), (more, of_second):
+            return more / of_second - some / of_first, newcombe((some, of_first), (more, of_second))
+        case (middle, _, _), (other, _, _):
+            return other - middle, welch(first, second)  # type: ignore[arg-type]
+    return None
 
 
-def _share(counted: Any) -> tuple[Any, Any]:
-    """Return functions for a share and for the difference of two; `counted` returns (number, total) of a result, or None."""
-    return _figure(counted, lambda some, of_all: some / of_all, wilson, newcombe, ".2f", 100.0)
+def _errors(name: str, result: dict[str, Any]) -> Counted:
+    """Return an error by command; its mean from a file that lacks the cells."""
+    tracking = tracking_of(result)
+    try:
+        cells = {tuple(cell["command"]): float(cell[name]) for cell in tracking["cells"] if cell[name] is not None}
+    except BROKEN:
+        cells = {}
+    return cells or value_at(tracking, f"{name}.mean")  # type: ignore[no-any-return]
 
 
-def _failures(result: dict[str, Any]) -> tuple[int, int] | None:
-    count = int(result["episodes"]["count"]) if "episodes" in result else 0
+def _failures(result: dict[str, Any]) -> Counted:
+    count = int(value_at(result, "episodes.count") or 0)
     return (round(result["episodes"]["failures"] * count), count) if count > 0 else None
 
 
-def _spread(result: dict[str, Any]) -> tuple[float, float, int] | None:
+def _returns(result: dict[str, Any]) -> Counted:
     """Return mean and sample standard deviation of returns, and the number of episodes. The file holds the population's
     standard deviation, which is a little smaller.
     """
-    episodes = result.get("episodes")
-    if episodes is None or int(episodes["count"]) < 1:
+    count = int(value_at(result, "episodes.count") or 0)
+    if count < 1:
         return None
-    count = int(episodes["count"])
-    return episodes["return"]["mean"], episodes["return"]["std"] * sqrt(count / max(count - 1, 1)), count
-
-
-def _success(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> list[str]:
-    """Return a drawing a terrain type that at least two of the runs have crossed."""
-    entries = [types_in(result or {}) for result in results]
-    found = []
-    for kind in dict.fromkeys(kind for one in entries for kind in one):
-        there = [(one[kind], success_line(name, one[kind])) for name, one in zip(names, entries, strict=True) if kind in one]
-        if len(there) > 1:
-            found.append(curves(success_chart(kind.replace("_", " "), there)))
-    return found
+    returns = result["episodes"]["return"]
+    return returns["mean"], returns["std"] * sqrt(count / max(count - 1, 1)), count

@@ -1,19 +1,16 @@
 """Pages in parts: written as one HTML file that needs no other, or as Markdown with its pictures in their own files."""
 
 import base64
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import NamedTuple
 
+from legged.evaluation.reports import render
 from legged.evaluation.reports.charts import sheet
 from legged.evaluation.tables import markdown_table
 from legged.process.paths import write_text
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 SHORT = 32
 """Letters of a cell that stay on one line."""
@@ -26,16 +23,14 @@ class Mono(str):
     __slots__ = ()
 
 
-@dataclass(frozen=True)
-class Link:
+class Link(NamedTuple):
     """A text that leads to another file."""
 
     text: str
     href: str
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number: its text, and the value that it is sorted by."""
 
     text: str
@@ -45,23 +40,20 @@ class Number:
 Cell = str | Mono | Link | Number
 
 
-@dataclass(frozen=True)
-class Heading:
+class Heading(NamedTuple):
     """The title of the parts that follow."""
 
     text: str
 
 
-@dataclass(frozen=True)
-class Paragraph:
+class Paragraph(NamedTuple):
     """Sentences, with code between backticks; a short `badge` may stand before them."""
 
     text: str
     badge: str = ""
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """Rows under a head; a `wide` table can be sorted by its columns and filtered by words."""
 
     head: Sequence[str]
@@ -74,8 +66,7 @@ class Table:
         return [bool(self.rows) and all(isinstance(row[i], Number) for row in self.rows) for i in range(len(self.head))]
 
 
-@dataclass(frozen=True)
-class Figures:
+class Figures(NamedTuple):
     """Drawings (SVG), side by side where there is room; in Markdown one file of that `name`."""
 
     name: str
@@ -83,8 +74,7 @@ class Figures:
     alt: str
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """A picture or film in a file."""
 
     path: Path
@@ -101,8 +91,7 @@ class Picture:
         return f"data:{self.mime};base64,{base64.b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
-@dataclass(frozen=True)
-class Listing:
+class Listing(NamedTuple):
     """Lines of a program or a difference, folded up in a page; Markdown names their `file`."""
 
     title: str
@@ -111,6 +100,16 @@ class Listing:
 
 
 Part = Heading | Paragraph | Table | Figures | Picture | Listing
+
+
+def number(value: float | None, form: str = ".3f") -> Number:
+    """Return a number as a cell; a dash, which is not sorted, for None and for values that are not finite."""
+    return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}", value)
+
+
+def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
+    """Return an interval as text."""
+    return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
 
 
 def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
@@ -131,25 +130,10 @@ def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
 # ---- HTML ------------------------------------------------------------------------------------------------------------
 
 
-@cache
-def _templates() -> "Environment":
-    from jinja2 import Environment, PackageLoader  # takes a while
-
-    found = Environment(loader=PackageLoader(__package__), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    found.globals |= {"kind_of": lambda one: type(one).__name__, "pieces": _pieces, "SHORT": SHORT}
-    return found
-
-
-def render(template: str, **values: Any) -> str:
-    """Return a page from a template in the folder templates/; texts are escaped. A page holds its style and its script, and
-    its content security policy lets it load nothing else.
-    """
-    return _templates().get_template(template).render(values)
-
-
 def to_html(title: str, parts: Sequence[Part]) -> str:
     """Return a whole page, which holds its pictures too."""
-    return render("document.html", title=title, parts=parts)
+    kinds = {"kind_of": lambda one: type(one).__name__, "pieces": _pieces, "SHORT": SHORT}
+    return render("document.html", title=title, parts=parts, **kinds)
 
 
 def _pieces(text: str) -> list[str]:

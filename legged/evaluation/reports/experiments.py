@@ -6,13 +6,14 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from legged.evaluation.engines import ENGINES
+from legged.config.dotted import value_at
+from legged.evaluation.engines import in_order
 from legged.evaluation.learning_curves import smooth
-from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, text_of
-from legged.evaluation.reports.evaluation_part import number
+from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, number, text_of
 from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
 from legged.evaluation.reports.run_report import REPORT
-from legged.evaluation.result_file import has_tracking, tracking_of
+from legged.evaluation.result_file import tracking_of
+from legged.evaluation.success import types_in
 
 TITLE = "Experiments"
 EMPTY = ("", "-")
@@ -71,7 +72,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
     for name, form in FORMS.items():
         known = [cell.value for row in rows if isinstance(cell := row[name], Number) and cell.value is not None]
         shared[name] = number(mean(known) if known else None, form)
-    seeds = [value for record in group if (value := _whole(record.at("env.seed"))) is not None]
+    seeds = [seed for record in group if isinstance(seed := record.at("env.seed"), int)]
     shared["seed"] = Number(", ".join(f"{seed:,d}" for seed in sorted(seeds)), min(seeds, default=None))
     shared["evaluated"] = ", ".join(dict.fromkeys(text for row in rows if (text := text_of(row["evaluated"]))))
     shared["what changed"] = what_changed(group[0], named=False)
@@ -79,22 +80,21 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return the row of a run, by column."""
+    """Return the row of a run, by column; figures of evaluations are those in the first engine of ENGINES that has one."""
     timing = record.timing
-    steps = timing.steps if timing else None
-    judged = _judged(record)
-    tracking = tracking_of(judged) if judged is not None and has_tracking(judged) else {}
-    episodes = judged["episodes"] if judged is not None and "episodes" in judged else None
+    by_engine = {result["physics"]: result for result in record.results}
+    judged = by_engine[in_order(by_engine)[0]] if by_engine else {}
+    tracking = tracking_of(judged)
     figures = {
-        "RMSE [m/s]": tracking["rmse_lin"]["mean"] if tracking else None,
-        "yaw rate RMSE [rad/s]": tracking["rmse_ang"]["mean"] if tracking else None,
-        "falls [%]": 100.0 * tracking["falls"] if tracking else None,
-        "stairs [m]": None if judged is None else highest_stairs(judged),
-        "return, evaluated": episodes["return"]["mean"] if episodes else None,
+        "RMSE [m/s]": value_at(tracking, "rmse_lin.mean"),
+        "yaw rate RMSE [rad/s]": value_at(tracking, "rmse_ang.mean"),
+        "falls [%]": 100.0 * tracking["falls"] if "falls" in tracking else None,
+        "stairs [m]": highest_stairs(judged),
+        "return, evaluated": value_at(judged, "episodes.return.mean"),
         "terrain level": _last(record, "Terrain/level"),
         "return": _last(record, "Train/mean_reward"),
         "velocity error [m/s]": _last(record, "Metrics/lin_vel_rmse"),
-        "steps [M]": None if steps is None else steps / 1e6,
+        "steps [M]": timing.steps / 1e6 if timing else None,
         "start-up [s]": timing.start_up_s if timing else None,
         "loop [s]": timing.loop_s if timing else None,
         "steps/s": timing.steps_per_s if timing else None,
@@ -105,11 +105,11 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
         "what changed": what_changed(record),
         "status": record.status,
         "iterations": number(record.done, ",.0f"),
-        "seed": number(_whole(record.at("env.seed")), ",.0f"),
+        "seed": number(seed if isinstance(seed := record.at("env.seed"), int) else None, ",.0f"),
         "evaluated": record.another_policy(judged),
         **{name: number(value, FORMS[name]) for name, value in figures.items()},
         "robots": number(record.robots, ",.0f"),
-        "device": ("" if timing is None else "CPU" if timing.device == "cpu" else timing.device),
+        "device": "" if timing is None else "CPU" if timing.device == "cpu" else timing.device,
         "commit": Mono(record.code.commit[:10] + ("+" if record.code.files else "")),
     }
 
@@ -118,32 +118,21 @@ def highest_stairs(result: dict[str, Any]) -> float | None:
     """Return the height of the highest steps that robots crossed up and down, with all lower ones [m]; 0 if they did not
     cross the lowest; None without an evaluation both ways.
     """
-    types = result.get("success", {}).get("types", {})
-    ways = [{point["size"]: point["share"] for point in types.get(name, {"points": []})["points"]} for name in STAIRS]
+    points = [types_in(result).get(name, {}).get("points", []) for name in STAIRS]
+    ways = [{point["size"]: point["share"] for point in of_type} for of_type in points]
     sizes = sorted(ways[0].keys() & ways[1].keys())
     crossed = list(itertools.takewhile(lambda size: min(way[size] for way in ways) >= PASSED, sizes))
     return max(crossed, default=0.0) if sizes else None
 
 
 def _began(record: Record, beside: Path, ending: str) -> Cell:
-    text = f"{record.began:%Y-%m-%d %H:%M}"
-    report = record.folder / f"{REPORT}.{ending}"
-    place = report.resolve()
-    if place.is_file() and place.is_relative_to(beside.resolve()):
-        return Link(text, place.relative_to(beside.resolve()).as_posix())
+    """Return the time at which a run began, as a link to its report if that lies below `beside`."""
+    text, report = f"{record.began:%Y-%m-%d %H:%M}", (record.folder / f"{REPORT}.{ending}").resolve()
+    if report.is_file() and report.is_relative_to(beside.resolve()):
+        return Link(text, report.relative_to(beside.resolve()).as_posix())
     return text
-
-
-def _whole(value: Any) -> int | None:
-    return value if isinstance(value, int) else None
 
 
 def _last(record: Record, tag: str) -> float | None:
     """Return the last value of a curve, as a running mean."""
     return float(smooth(record.scalars[tag][1])[-1]) if tag in record.scalars else None
-
-
-def _judged(record: Record) -> dict[str, Any] | None:
-    """Return the evaluation of a run in the first engine of ENGINES that has one."""
-    order = [*ENGINES, *(result["physics"] for result in record.results)]
-    return min(record.results, key=lambda result: order.index(result["physics"]), default=None)

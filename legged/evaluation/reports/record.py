@@ -4,6 +4,7 @@ import os
 import re
 import socket
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -21,7 +22,6 @@ from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkp
 from legged.learning.timing import Timing, read_timing
 from legged.registry import task_config
 
-STAMP = re.compile(r"(\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2})(?:_(.*))?")
 FILMS = ("film.gif", "play.gif", "play.mp4")
 """Films of the policy; the first that exists is shown."""
 NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
@@ -33,6 +33,8 @@ DEEPEST = 3
 """Levels of folders in which runs are searched: logs, tasks, runs."""
 QUIET_S = 3600.0
 """A training that has written nothing for this long has ended, even if a process has its number [s]."""
+QUIET_ELSEWHERE_S = 120.0
+"""The same for a training on another machine [s]."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,7 @@ class Record:
     @property
     def name(self) -> str:
         """Name of the folder, after that of its experiment."""
-        folder = self.folder.resolve()
-        return f"{folder.parent.name}/{folder.name}"
-
-    @property
-    def run_name(self) -> str:
-        """Name given to the run; empty if none was given."""
-        return str(self.at("train.runner.run_name") or "")
+        return "/".join(self.folder.resolve().parts[-2:])
 
     @property
     def robots(self) -> int | None:
@@ -117,6 +113,11 @@ class Record:
         return steps * self.robots if isinstance(steps, int) and self.robots else None
 
     @property
+    def changes(self) -> dict[str, Any]:
+        """Settings of its command line, as far as they are known."""
+        return {} if self.given is None else dict(self.given.changes)
+
+    @property
     def log(self) -> Log:
         """Logged values and configuration."""
         return Log(self.scalars, self.config)
@@ -125,11 +126,6 @@ class Record:
         """Return the checkpoint of an evaluation; an empty text if it is the last one, which the other figures describe."""
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
-
-    @property
-    def film(self) -> Path | None:
-        """Film of its policy, if there is one."""
-        return next((path for name in FILMS if (path := self.folder / name).is_file()), None)
 
 
 def folders_in(path: Path) -> list[Path]:
@@ -154,21 +150,20 @@ def read_record(folder: Path) -> Record:
     if not (folder / CONFIG_FILE).is_file():
         raise ConfigError(f"{folder}: is no run folder (it has no {CONFIG_FILE})")
     problems: list[str] = []
-    config = read_config(folder)
-    timing, scalars, given = None, {}, None
-    with _noting(problems):
-        config = to_dict(run_config(folder))
-    with _noting(problems):
-        timing = read_timing(folder)
-    with _noting(problems):
-        given = read_invocation(folder)
-    if any(folder.glob("events.out.tfevents.*")):
-        with _noting(problems):
-            scalars = read_scalars(folder)
-    results: list[dict[str, Any]] = []
-    for path in sorted(folder.glob(file_name("*"))):
-        with _noting(problems):
-            results += read_results([path])
+
+    def known(read: Callable[[Path], Any], path: Path = folder, otherwise: Any = None) -> Any:
+        """Return what `read` finds; note why it fails, and return `otherwise` then."""
+        try:
+            return read(path)
+        except (ConfigError, OSError, ValueError) as error:
+            problems.append(" ".join(str(error).split()))
+            return otherwise
+
+    config = known(lambda path: to_dict(run_config(path)), otherwise=read_config(folder))
+    timing, given = known(read_timing), known(read_invocation)
+    scalars = known(read_scalars, otherwise={}) if any(folder.glob("events.out.tfevents.*")) else {}
+    files = sorted(folder.glob(file_name("*")))
+    results = [result for path in files for result in known(lambda one: read_results([one]), path, [])]
     logged = [int(steps[-1]) + 1 for tag, (steps, _) in scalars.items() if not tag.endswith("/time") and len(steps)]
     saved = [number + 1 for number, path in checkpoints(folder).items() if path.name != "model.pt"]
     done = max([*logged, *saved], default=timing.iterations if timing else 0)
@@ -179,26 +174,10 @@ def read_record(folder: Path) -> Record:
     )  # fmt: skip
 
 
-class _noting(suppress):  # noqa: N801  (a context, as its base)
-    """Suppress errors of reading, and add their texts to a list."""
-
-    def __init__(self, problems: list[str]) -> None:
-        super().__init__(ConfigError, OSError, ValueError)
-        self._problems = problems
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
-        left_out = bool(super().__exit__(kind, error, trace))
-        if left_out:
-            self._problems.append(" ".join(str(error).split()))
-        return left_out
-
-
 def _began(folder: Path) -> datetime:
-    """Return the start of a run, from the name of its folder, else from its configuration's file."""
-    match = STAMP.match(folder.resolve().name)
+    """Return the start of a run, from the beginning of its folder's name, else from its configuration's file."""
     with suppress(ValueError):
-        if match:
-            return datetime.strptime(match[1], "%Y-%m-%d_%H-%M-%S")
+        return datetime.strptime(folder.resolve().name[:19], "%Y-%m-%d_%H-%M-%S")
     return datetime.fromtimestamp((folder / CONFIG_FILE).stat().st_mtime)
 
 
@@ -227,17 +206,14 @@ def is_running(folder: Path) -> bool:
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
-        if match is None:
-            continue
         with suppress(OSError):
-            silent_s = time.time() - path.stat().st_mtime
-            if match[1] != socket.gethostname():
-                if silent_s < 120.0:
-                    return True
-            elif silent_s < QUIET_S:
-                with suppress(PermissionError):  # the process exists and belongs to another user
+            here = match is not None and match[1] == socket.gethostname()
+            if match is None or time.time() - path.stat().st_mtime >= (QUIET_S if here else QUIET_ELSEWHERE_S):
+                continue
+            with suppress(PermissionError):  # the process exists and belongs to another user
+                if here and match is not None:
                     os.kill(int(match[2]), 0)  # signal 0 only checks that the process exists
-                return True
+            return True
     return False
 
 
@@ -248,7 +224,7 @@ def read_code(folder: Path) -> Code:
     except OSError:
         return Code()
     head, *rest = text.splitlines() or [""]
-    commit = next((line.removeprefix("commit ") for line in rest[:1] if line.startswith("commit ")), "")
+    commit = rest[0].removeprefix("commit ") if rest and rest[0].startswith("commit ") else ""
     lines = [line for line in rest if line[:1] in ("+", "-") and not line.startswith(("+++ ", "--- "))]
     files = sum(line.startswith("diff --git ") for line in rest)
     added = sum(line[0] == "+" for line in lines)
@@ -270,13 +246,11 @@ def from_task_file(record: Record) -> dict[str, list[Any]] | None:
     A run without a known device is compared with the nearer of the settings for a CPU and for a GPU.
     """
     where = [record.timing.device == "cpu"] if record.timing else [False, True]
-    found = []
-    for on_cpu in where:
-        try:
-            found.append(differences([record.config, to_dict(task_config(record.task, on_cpu=on_cpu))]))
-        except (ConfigError, OSError):
-            return None
-    return min(found, key=len)
+    try:
+        of_task = [to_dict(task_config(record.task, on_cpu=on_cpu)) for on_cpu in where]
+    except (ConfigError, OSError):
+        return None
+    return min((differences([record.config, config]) for config in of_task), key=len)
 
 
 def words(value: Any) -> str:
@@ -294,16 +268,14 @@ def what_changed(record: Record, named: bool = True) -> str:
     if record.note:
         return record.note
     found = from_task_file(record)
-    if found is not None:
-        changed = {path: own for path, (own, _) in found.items()}
-    else:
-        changed = dict(record.given.changes) if record.given is not None else {}
+    changed = record.changes if found is None else {path: own for path, (own, _) in found.items()}
     said = [
         f"{'.'.join(path.split('.')[-2:])} {words(own)}" for path, own in changed.items() if path not in (*NAMES, "env.seed")
     ]
     if len(said) > MOST_WORDS:
         said = [*said[:MOST_WORDS], f"{len(said) - MOST_WORDS} more settings"]
-    return ": ".join(text for text in (record.run_name if named else "", ", ".join(said)) if text)
+    name = str(record.at("train.runner.run_name") or "") if named else ""
+    return ": ".join(text for text in (name, ", ".join(said)) if text)
 
 
 def but_for_seeds(record: Record) -> str:

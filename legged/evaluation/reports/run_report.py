@@ -6,12 +6,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from legged.evaluation.learning_curves import Scalars, smooth
-from legged.evaluation.reports.curves import curves_of_run
+from legged.evaluation.engines import engine_of, in_order
+from legged.evaluation.intervals import wilson
+from legged.evaluation.learning_curves import curves_of_run, smooth, times_of
+from legged.evaluation.reports.charts import curves, heat_map
 from legged.evaluation.reports.document import (
     Cell,
     Figures,
@@ -23,10 +27,15 @@ from legged.evaluation.reports.document import (
     Part,
     Picture,
     Table,
+    between,
+    number,
     write_pages,
 )
-from legged.evaluation.reports.evaluation_part import evaluation_parts, number
-from legged.evaluation.reports.record import Record, from_task_file, read_record, words
+from legged.evaluation.reports.record import FILMS, Record, from_task_file, read_record, words
+from legged.evaluation.result_file import BROKEN, changes_text, falls_of, has_tracking, tracking_of
+from legged.evaluation.success import success_charts
+from legged.evaluation.velocity_grid import AXES
+from legged.evaluation.velocity_tracking import PANELS, grid_means
 from legged.learning.invocation import Invocation
 from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
 from legged.process import headless
@@ -46,16 +55,23 @@ FILMING: list[subprocess.Popen] = []
 """Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
 """Most letters of a difference in the page; its file holds all of it."""
-OVER_TRAINING = (
-    ("Train/mean_reward", "return", 1.0, ".2f"),
-    ("Train/std_reward", "standard deviation of the return", 1.0, ".2f"),
-    ("Metrics/lin_vel_rmse", "velocity error [m/s]", 1.0, ".3f"),
-    ("Metrics/ang_vel_rmse", "yaw rate error [rad/s]", 1.0, ".3f"),
-    ("Metrics/falls", "falls [%]", 100.0, ".1f"),
-    ("Metrics/episode_length", "episode [steps]", 1.0, ".0f"),
-    ("Terrain/level", "terrain level", 1.0, ".2f"),
+ON_GRID = (
+    "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
+    " interval of falls is Wilson's. A cell of the maps is the mean over the third command."
 )
-"""Tag, head, factor and form of the columns of the table over training."""
+ON_TERRAIN = (
+    "Robots that get out of a tile of each size, with Wilson's interval of 95 %; a dotted line is the hardest of training."
+)
+OVER_TRAINING = {
+    "Train/mean_reward": ("return", 1.0, ".2f"),
+    "Train/std_reward": ("standard deviation of the return", 1.0, ".2f"),
+    "Metrics/lin_vel_rmse": ("velocity error [m/s]", 1.0, ".3f"),
+    "Metrics/ang_vel_rmse": ("yaw rate error [rad/s]", 1.0, ".3f"),
+    "Metrics/falls": ("falls [%]", 100.0, ".1f"),
+    "Metrics/episode_length": ("episode [steps]", 1.0, ".0f"),
+    "Terrain/level": ("terrain level", 1.0, ".2f"),
+}
+"""Tag -> head, factor and form of the columns of the table over training."""
 
 
 def write_report(folder: Path) -> Path:
@@ -66,12 +82,7 @@ def write_report(folder: Path) -> Path:
         RunError: a file can't be written.
     """
     record = read_record(folder)
-    return write_pages(folder / REPORT, title_of(record), report_parts(record))
-
-
-def title_of(record: Record) -> str:
-    """Return the title of a run's report."""
-    return f"{record.task}: {record.folder.resolve().name}"
+    return write_pages(folder / REPORT, f"{record.task}: {record.folder.resolve().name}", report_parts(record))
 
 
 def report_parts(record: Record) -> list[Part]:
@@ -87,10 +98,7 @@ def report_parts(record: Record) -> list[Part]:
         parts += [Heading("Curves"), Figures("curves", curves_of_run(record.log), "learning curves")]
     else:
         parts += [Heading("Curves"), Paragraph("This folder holds no TensorBoard file with values.")]
-    parts += evaluation_parts(record.results, record.another_policy) or [
-        Heading("Evaluation"),
-        Paragraph(f"None yet: `{command_on(record, 'evaluate')}`"),
-    ]
+    parts += _evaluations(record)
     if record.problems:
         parts += [Heading("What could not be read"), *(Paragraph(text) for text in record.problems)]
     if record.code.text:
@@ -126,8 +134,8 @@ def _facts(record: Record) -> list[list[Cell]]:
             "time for the rest": f"{rest_s:.1f} s (graphs captured, checkpoints); {timing.wall_s:.1f} s in all",
         }
     elif record.scalars:
-        seconds, _ = _loop_time(record.scalars)
-        found["time to train"] = f"{seconds[-1]:.1f} s in the log" if len(seconds) else None
+        _, seconds = times_of(record.scalars)
+        found["time to train"] = f"{seconds.sum():.1f} s in the log" if len(seconds) else None
     faults = [tag for tag in record.scalars if tag.startswith("Faults/")]
     lost = record.scalars.get("Metrics/contact_overflows")
     saved = checkpoints(record.folder)
@@ -141,28 +149,23 @@ def _facts(record: Record) -> list[list[Cell]]:
 
 
 def _film(record: Record) -> list[Part]:
-    """Return the film of a policy, if it exists and is small enough."""
-    film = record.film
-    if film is None:
-        return []
-    try:
-        size = film.stat().st_size
-    except OSError:
-        return []
-    if not 0 < size <= LARGEST_FILM:
-        return [Paragraph(f"A film of the policy is in {film.name} ({size / 2**20:.0f} MiB).")]
-    return [Picture(film, "the last policy")]
+    """Return the first film of the policy that exists, if it is small enough."""
+    for film in (record.folder / name for name in FILMS):
+        with suppress(OSError):
+            size = film.stat().st_size
+            if not 0 < size <= LARGEST_FILM:
+                return [Paragraph(f"A film of the policy is in {film.name} ({size / 2**20:.0f} MiB).")]
+            return [Picture(film, "the last policy")]
+    return []
 
 
 def _differences(record: Record) -> list[Part]:
     """Return the settings in which a run differs from its task."""
-    heading = Heading("Settings other than the task's")
-    found = from_task_file(record)
+    heading, found = Heading("Settings other than the task's"), from_task_file(record)
     if found is None:
         told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
         text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
-        changes = {} if record.given is None else record.given.changes
-        set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in changes.items()]
+        set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in record.changes.items()]
         return [heading, Paragraph(text), *([Table(["setting", "the command line"], set_there)] if set_there else [])]
     if not found:
         return [heading, Paragraph("None: the run is its task as the task is now.")]
@@ -173,41 +176,85 @@ def _differences(record: Record) -> list[Part]:
 def over_training(record: Record) -> Table:
     """Return about ten rows over a training: steps, time, returns, errors."""
     scalars = record.scalars
-    columns = [column for column in OVER_TRAINING if column[0] in scalars]
-    first = scalars[columns[0][0]][0] if columns else next(iter(scalars.values()))[0]
-    steps = np.unique(np.concatenate([scalars[tag][0] for tag, *_ in columns])) if columns else np.unique(first)
+    columns = {tag: column for tag, column in OVER_TRAINING.items() if tag in scalars}
+    steps = np.unique(np.concatenate([scalars[tag][0] for tag in columns or [next(iter(scalars))]]))
     picked = steps[np.unique(np.linspace(0, len(steps) - 1, ROWS).round().astype(int))]
-    seconds, at = _loop_time(scalars)
-    smoothed = {tag: (scalars[tag][0], smooth(factor * scalars[tag][1])) for tag, _, factor, _ in columns}
+    at, seconds = times_of(scalars)
+    drawn = [(at, np.cumsum(seconds), ".1f")]
+    drawn += [(scalars[tag][0], smooth(factor * scalars[tag][1]), form) for tag, (_, factor, form) in columns.items()]
+    per_iteration = record.steps_per_iteration
     rows: list[list[Cell]] = []
     for step in picked:
-        count = None if record.steps_per_iteration is None else float((step + 1) * record.steps_per_iteration)
-        until = at <= step
+        count = None if per_iteration is None else float((step + 1) * per_iteration)
         row: list[Cell] = [Number(f"{step + 1:,d}", float(step + 1)), number(count, ",.0f")]
-        row.append(number(float(seconds[until][-1]) if until.any() else None, ".1f"))
-        row += [number(_at(smoothed[tag], step), form) for tag, _, _, form in columns]
+        for iterations, values, form in drawn:  # the last value up to this iteration
+            before = values[iterations <= step]
+            row.append(number(float(before[-1]) if len(before) else None, form))
         rows.append(row)
     clock = "time since it was resumed [s]" if record.timing is not None and record.timing.resumed else "time [s]"
-    return Table(["iteration", "steps", clock, *(head for _, head, _, _ in columns)], rows)
+    return Table(["iteration", "steps", clock, *(head for head, _, _ in columns.values())], rows)
 
 
-def _at(curve: tuple[np.ndarray, np.ndarray], step: int) -> float | None:
-    """Return the last value of a curve up to an iteration; None before its first."""
-    before = np.flatnonzero(curve[0] <= step)
-    return float(curve[1][before[-1]]) if len(before) else None
+# ---- evaluations -----------------------------------------------------------------------------------------------------
 
 
-def _loop_time(scalars: Scalars) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cumulated seconds of the training loop in the log, and their iterations."""
-    both = [
-        dict(zip(*scalars[f"Perf/{name}_time"], strict=True))
-        for name in ("collection", "learning")
-        if f"Perf/{name}_time" in scalars
+def _evaluations(record: Record) -> list[Part]:
+    """Return the part on evaluations, by engine: tables, heat maps over commands, success over difficulty, returns."""
+    parts: list[Part] = [Heading("Evaluation")]
+    if not record.results:
+        return [*parts, Paragraph(f"None yet: `{command_on(record, 'evaluate')}`")]
+    by_engine = {result["physics"]: result for result in record.results}
+    results = [(engine_of(name).label, by_engine[name]) for name in in_order(by_engine)]
+    for label, result in results:
+        if file := record.another_policy(result):
+            parts.append(Paragraph(f"In {label} it is of `{file}`, which is not the last policy."))
+        if result.get("changes"):
+            parts.append(Paragraph(f"In {label} it was made with {changes_text(result)}."))
+    following = [(label, result) for label, result in results if "episodes" not in result]
+    tracked = [(label, tracking_of(result)) for label, result in following if has_tracking(result)]
+    rows: list[list[Cell]] = []
+    for label, tracking in tracked:
+        counted = falls_of(tracking)
+        errors = [number(tracking[name][part]) for name in ("rmse_lin", "rmse_ang") for part in ("mean", "worst")]
+        falls = [number(100.0 * tracking["falls"], ".2f"), between(wilson(*counted), 100.0, ".2f") if counted else "-"]
+        rows.append([label, *errors, *falls, number(tracking.get("cost_of_transport"), ".2f")])
+    heads = ["engine", "velocity RMSE [m/s]", "worst cell", "yaw rate RMSE [rad/s]", "worst cell", "falls [%]"]
+    parts += [Paragraph(ON_GRID), Table([*heads, "95 % interval", "cost of transport"], rows)] if rows else []
+    maps = [drawing for label, tracking in tracked for drawing in _heat_maps(tracking, label)]
+    parts += [Figures("tracking", maps, "velocity and yaw rate errors over commands")] if maps else []
+    success = [curves(chart) for chart in success_charts([result for _, result in following])]
+    parts += [Paragraph(ON_TERRAIN), Figures("success", success, "success over difficulty")] if success else []
+    for label, result in results:
+        parts += _episodes(label, result["episodes"]) if "episodes" in result else []
+    return parts
+
+
+def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
+    """Return maps of errors over commands; none if the file lacks the cells."""
+    try:
+        grid, found = tracking["grid"], []
+        for name, over, other, title in PANELS:
+            values = grid_means(tracking, name, over)
+            where = (f"commanded vx [{AXES['vx']}]", f"commanded {other} [{AXES[other]}]")
+            found.append(heat_map(f"{title}, {label}", *where, grid["vx"], grid[other], values))
+        return found
+    except BROKEN:
+        return []
+
+
+def _episodes(label: str, episodes: dict[str, Any]) -> list[Part]:
+    """Return a table of full episodes."""
+    rows: list[list[Cell]] = []
+    for measure, key in (("return", "return"), ("length [control steps]", "length")):
+        rows.append([measure, *(number(episodes[key][part], ".1f") for part in ("mean", "std", "min", "max"))])
+    single = [(f"return of {name}", number(value, ".1f")) for name, value in episodes["terms"].items()]
+    single.append(("ended in a failure [%]", number(100.0 * episodes["failures"], ".1f")))
+    single += [(name.replace("_", " "), number(value)) for name, value in episodes["metrics"].items()]
+    rows += [[name, value, *[number(None)] * 3] for name, value in single]
+    return [
+        Paragraph(f"{episodes['count']:.0f} full episodes without noise, in {label}."),
+        Table(["measure", "mean", "standard deviation", "least", "greatest"], rows),
     ]
-    if len(both) < 2:
-        return np.array([]), np.array([])
-    steps = sorted(both[0].keys() & both[1].keys())
-    return np.cumsum([both[0][step] + both[1][step] for step in steps]), np.array(steps)
 
 
 # ---- after a training --------------------------------------------------------------------------------------------------

@@ -1,28 +1,44 @@
-"""The measurements of the stress test: disturbances on stairs and on the flat, new ground, and other solvers."""
+"""The stress test: disturbances on stairs and on the flat, new ground, and other solvers; measured, printed and drawn."""
 
 import gc
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Sequence
 from functools import partial
 from math import sqrt
+from pathlib import Path
 from typing import Any
 
 import torch
+from rich.console import Console
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, override
 from legged.errors import ConfigError
-from legged.evaluation.intervals import mean_of_shares, wilson
-from legged.evaluation.overflows import Overflows
-from legged.evaluation.stress.stressed_task import GIVEN, StressedTask, declared, make_stressed
-from legged.evaluation.stress.table import NOMINAL, WRITTEN_FOR, Disturbance, table
-from legged.evaluation.success import point, run_out, to_run_out
+from legged.evaluation.intervals import mean_of_shares
+from legged.evaluation.measurement import Setting, warn_of_overflows
+from legged.evaluation.result_file import stress_name, write_result
+from legged.evaluation.stress.disturbances import (
+    GIVEN,
+    NOMINAL,
+    WRITTEN_FOR,
+    Disturbance,
+    StressedTask,
+    declared,
+    make_stressed,
+    table,
+)
+from legged.evaluation.success import FORWARD, TIME_S, point, run_out, share_of, to_run_out
+from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.evaluation.velocity_grid import axes_of, number_or_null
+from legged.evaluation.velocity_tracking import hold
+from legged.figures import figure
 from legged.mdp.actuator_network import NetworkWeights
 from legged.mdp.tracking_error import velocity_error
-from legged.policies.restore import TrainedPolicy, restore, undisturbed
+from legged.policies.episodes import Policy
+from legged.policies.restore import restore, undisturbed
+from legged.process.paths import relative
 from legged.robots.similarity import size_of
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 
@@ -43,68 +59,42 @@ COMMANDS = (
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
 """Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; robots have them in turn."""
+Changes = Sequence[tuple[str, Any]]
+"""Overrides of a configuration."""
 HALF_STEP = "half the time step"
 """Name of the setting that LSTM actuators do not allow."""
+COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "ground": "#E69F00"}
+"""Colours of bars, by their kind; those of Okabe and Ito."""
+LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
+COMBINED = ("together", "everything")
+SETTING_LINES = ("nominal", "together")
+"""Lines of the table that are measured with each setting of the solver without `full`."""
 
 
-@dataclass(frozen=True)
-class Wish:
-    """Values of the command line in place of the defaults."""
-
-    riser: float | None = None
-    """Height of the steps [m]; RISER times the scale by default."""
-    tread: float = TREAD
-    """Width of the steps [m]."""
-    payload: float | None = None
-    """Mass on the base [kg]; that of the table by default."""
-    lines: tuple[str, ...] = ()
-    """Names of the lines that are measured; by default all, with new ground and other solvers."""
-
-
-@dataclass(frozen=True)
-class Setting:
-    """Another solver setting, as overrides."""
-
-    name: str
-    changes: tuple[tuple[str, Any], ...]
-
-
-def settings(cfg: LeggedConfig, engine: str) -> list[Setting]:
-    """Return the solver settings to try, besides the task's own, that engine and motors allow."""
-    halved: tuple[tuple[str, Any], ...] = (("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation))
-    if cfg.control.actuator.delay[1]:  # in physics steps
-        halved = (*halved, ("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay]))
-    found = [Setting(HALF_STEP, halved)] if can_halve_step(cfg) else []
+def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
+    """Return name -> overrides of the solver settings to try, besides the task's own, that engine and motors allow."""
+    found: dict[str, list[tuple[str, Any]]] = {}
+    network = cfg.control.actuator.network
+    # An LSTM of the motors advances with every step of the length that it was trained with.
+    if not network or NetworkWeights.load(network).kind != "lstm":
+        found[HALF_STEP] = [("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation)]
+        if cfg.control.actuator.delay[1]:  # in physics steps
+            found[HALF_STEP] += [("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay])]
     if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
-        found += [
-            Setting("elliptic cones", (("sim.cone", "elliptic"),)),
-            Setting("impratio 100", (("sim.impratio", 100.0), ("sim.iterations", max(50, cfg.sim.iterations)))),
-        ]
+        found["elliptic cones"] = [("sim.cone", "elliptic")]
+        found["impratio 100"] = [("sim.impratio", 100.0), ("sim.iterations", max(50, cfg.sim.iterations))]
     return found
 
 
-def can_halve_step(cfg: LeggedConfig) -> bool:
-    """Return whether a task can be simulated with half its time step. An LSTM of the motors can't, because it advances with
-    every step of the length that it was trained with.
-    """
-    network = cfg.control.actuator.network
-    return not network or NetworkWeights.load(network).kind != "lstm"
-
-
-def check_asked(changes: Sequence[tuple[str, Any]]) -> None:
-    """Check that the command line randomises no property that the lines of the table set.
-
-    Raises:
-        ConfigError: it randomises one.
-    """
+def check_asked(changes: Changes) -> None:
+    """Check that the command line randomises no property that the lines of the table set."""
     ranges = "domain_rand.ranges"
     for key, value in changes:
-        names = value if key == ranges and isinstance(value, dict) else (key.removeprefix(f"{ranges}.").split(".")[0],)
+        names = value if key == ranges and isinstance(value, dict) else [key.removeprefix(f"{ranges}.").split(".")[0]]
         for name in names if key.startswith(ranges) else ():
             if name in GIVEN:
-                raise ConfigError(
-                    f"command line: {ranges}.{name}: legged evaluate stress sets it in each of its lines; leave it out"
-                )
+                where = f"command line: {ranges}.{name}"
+                raise ConfigError(f"{where}: legged evaluate stress sets it in each of its lines; leave it out")
 
 
 class Bench:
@@ -112,39 +102,40 @@ class Bench:
 
     def __init__(
         self,
-        policy: TrainedPolicy,
+        setting: Setting,
         robots: int,
-        wish: Wish,
-        asked: Sequence[tuple[str, Any]],
-        device: torch.device,
-        graph: bool,
+        riser: float | None = None,
+        tread: float = TREAD,
+        payload: float | None = None,
+        lines: Sequence[str] = (),
     ) -> None:
-        """Take `robots` for each line of the table; `asked` holds the overrides of the command line.
+        """Take `robots` for each line of the table. `riser` and `tread` are the height and the width of the steps [m],
+        `payload` is the mass on the base [kg], and `lines` names the lines that are measured; by default RISER times the
+        scale, the table's mass, and all lines.
 
         Raises:
-            ConfigError: the robot cannot be loaded, or `asked` randomises a property that the table sets.
+            ConfigError: the robot cannot be loaded, or an override randomises a property that the table sets.
         """
-        check_asked(asked)
-        assert isinstance(policy.cfg, LeggedConfig), "the task follows no commands"
-        self.cfg: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
-        rows = table(size_of(policy.cfg.robot), size_of(WRITTEN_FOR), wish.payload)
-        self.rows = tuple(row for row in rows if not wish.lines or row.name in wish.lines)
+        check_asked(setting.overrides)
+        self.setting, self.robots, self.tread = setting, robots, tread
+        self.cfg: LeggedConfig = setting.cfg
+        rows = table(size_of(self.setting.policy.cfg.robot), size_of(WRITTEN_FOR), payload)  # type: ignore[attr-defined]
+        self.whole = not lines
+        self.rows = tuple(row for row in rows if self.whole or row.name in lines)
         """The lines of the table that are measured."""
         self.scale = self.cfg.terrain.scale
-        self.riser = round(RISER * self.scale, 3) if wish.riser is None else wish.riser
-        self.tread, self.robots = wish.tread, robots
+        self.riser = round(RISER * self.scale, 3) if riser is None else riser
         self.limit = LIMIT * sqrt(self.scale)
         """Largest error of a robot that follows its command [m/s]."""
         self.lost = 0
         """Number of control steps in which a robot lost contacts for want of memory."""
-        self._policy, self._asked, self._device, self._graph = policy, tuple(asked), device, graph
 
     @property
     def on_plane(self) -> bool:
         """True if the policy was trained on a plane; it is then measured on the flat only."""
         return self.cfg.terrain.mesh_type == "plane"
 
-    def measure(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def measure(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the figures of some lines of the table; `changes` choose a solver."""
         found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
         if not self.on_plane:
@@ -154,7 +145,7 @@ class Bench:
             line["flat"] = figures
         return found
 
-    def on_stairs(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def on_stairs(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the success of each line; half of its robots go up, the others down."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
@@ -170,20 +161,16 @@ class Bench:
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
         found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
-        return {
-            spec.type: {
-                "unit": TERRAIN_TYPES[spec.type].unit,
-                "what": TERRAIN_TYPES[spec.type].what,
-                **point(spec.size, *of_type),
-            }
-            for spec, *of_type in zip(specs, outcomes, times, strict=True)
-        }
+        ground = {}
+        for spec, *of_type in zip(specs, outcomes, times, strict=True):
+            kind = TERRAIN_TYPES[spec.type]
+            ground[spec.type] = {"unit": kind.unit, "what": kind.what, **point(spec.size, *of_type)}
+        return ground
 
-    def on_flat(self, rows: Sequence[Disturbance], changes: Sequence[tuple[str, Any]] = ()) -> list[dict[str, Any]]:
+    def on_flat(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the figures of each line's robots that follow commands on a plane."""
         per_robot = [row for row in rows for _ in range(self.robots)]
-        axes = axes_of(self.cfg)
-        ends = torch.tensor([[abs(axis[end]) for axis in axes.values()] for end in (0, -1)])
+        ends = torch.tensor([[abs(axis[end]) for axis in axes_of(self.cfg).values()] for end in (0, -1)])
         parts = torch.tensor(COMMANDS)
         commands = torch.where(parts < 0.0, parts * ends[0], parts * ends[1])
         turns = torch.arange(self.robots) % len(COMMANDS)
@@ -194,86 +181,51 @@ class Bench:
         ]
         task, act = self._build(per_robot, own, changes, None)
         error, fell = self._follow(task, act, commands[turns].repeat(len(rows), 1))
-        return [
-            followed(*of_row, self.limit) for of_row in zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)
-        ]
+        by_row = zip(error.view(len(rows), -1), fell.view(len(rows), -1), strict=True)
+        return [followed(*of_row, self.limit) for of_row in by_row]
 
     def _build(
-        self,
-        rows: Sequence[Disturbance],
-        own: Sequence[tuple[str, Any]],
-        last: Sequence[tuple[str, Any]],
-        terrain: Terrain | None,
-    ) -> tuple[StressedTask, Callable[[TensorDict], Tensor]]:
+        self, rows: Sequence[Disturbance], own: Changes, last: Changes, terrain: Terrain | None
+    ) -> tuple[StressedTask, Policy]:
         """Build a task and its policy. Overrides apply in the order `own`, the user's, `last`: another solver replaces the
         user's.
         """
         gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
-        make = partial(_make, rows)
-        changes = [*own, *declared(rows), *self._asked, *last]
-        return restore(self._policy, changes, self._device, self._graph, terrain, make)
+        changes = [*own, *declared(rows), *self.setting.asked, *last]
+        make = partial(make_stressed, rows)
+        return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
-    def _run_out(
-        self,
-        rows: Sequence[Disturbance],
-        specs: Sequence[TileSpec],
-        last: Sequence[tuple[str, Any]] = (),
-    ) -> tuple[Tensor, Tensor]:
+    def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
         """Return the outcomes (N,) of robots that are shared out among tiles, and their times [s]; `last` as for `_build`."""
         own = to_run_out(self.cfg, len(rows))
-        cfg: Any = override(self.cfg, [*own, *self._asked, *last])
+        cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
         scores, lost = run_out(task, act, len(rows) // len(specs))
         self.lost += lost
         return scores.outcome.cpu(), scores.time_s.cpu()
 
-    @torch.inference_mode()
-    def _follow(self, task: StressedTask, act: Callable[[TensorDict], Tensor], commands: Tensor) -> tuple[Tensor, Tensor]:
+    def _follow(self, task: StressedTask, act: Policy, commands: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
         before the measurement began, and flags of those that fell (N,).
         """
-        task.reset()
-        observations = task.hold_commands(commands.to(task.device))
-        alive = torch.ones(task.num_envs, dtype=torch.bool, device=task.device)
-        fell = torch.zeros_like(alive)
         total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
-        overflows = Overflows()
-        for step in range(round(HOLD_S / task.dt)):
-            observations, _, _, extras = task.step(act(observations))
-            overflows.add(extras)
-            fell |= alive & task.terminated_buf
-            alive &= ~task.reset_buf
-            if step >= round(SETTLE_S / task.dt):
-                total += torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0)
-                steps += alive
-        self.lost += overflows.total(task)
+
+        def add(_: TensorDict, alive: Tensor) -> None:
+            total.add_(torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0))
+            steps.add_(alive)
+
+        fell, lost = hold(task, act, commands.to(task.device), SETTLE_S, HOLD_S, add)
+        self.lost += lost
         return (total / steps).cpu(), fell.cpu()
-
-
-def _make(
-    rows: Sequence[Disturbance], cfg: LeggedConfig, device: torch.device, graph: bool, terrain: Terrain | None
-) -> StressedTask:
-    task: Any = make_stressed(cfg, rows, device, graph, terrain)
-    return task
 
 
 def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
     """Return the figures of robots (n,) on the flat, from the mean square errors of their velocities [m^2/s^2] and the flags
     of those that fell. A robot follows its command if it stands and its error is at most `limit` [m/s].
     """
-    good = ~fell & (error.sqrt() <= limit)
-    trials, successes = len(fell), int(good.sum())
-    low, high = wilson(successes, trials)
     known = error[~error.isnan()]
-    return {
-        "robots": trials,
-        "successes": successes,
-        "share": successes / trials,
-        "low": low,
-        "high": high,
-        "fell": int(fell.sum()),
-        "rmse_lin": number_or_null(float(known.double().mean().sqrt())) if len(known) else None,
-    }
+    rmse = number_or_null(float(known.double().mean().sqrt())) if len(known) else None
+    return {**share_of(~fell & (error.sqrt() <= limit), int(fell.sum())), "rmse_lin": rmse}
 
 
 def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, Any]:
@@ -281,12 +233,145 @@ def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, 
     stairs and on the flat, and over new ground; with its interval of 95 % and the means of the three parts.
     """
     disturbed = [line for line in lines if line["name"] != NOMINAL.name]
-    parts = {
-        "stairs": [line["stairs"] for line in disturbed if "stairs" in line],
-        "flat": [line["flat"] for line in disturbed],
-        "ground": list(ground.values()),
-    }
+    parts = {name: [line[name] for line in disturbed if name in line] for name in ("stairs", "flat")}
+    parts["ground"] = list(ground.values())
     counts = {name: [(one["successes"], one["robots"]) for one in found] for name, found in parts.items()}
     value, (low, high) = mean_of_shares([one for found in counts.values() for one in found])
     means = {name: mean_of_shares(found)[0] for name, found in counts.items() if found}
     return {"value": value, "low": low, "high": high, **means}
+
+
+# ---- the whole test --------------------------------------------------------------------------------------------------
+
+
+def evaluate_stress(bench: Bench, full: bool) -> int:
+    """Run the stress test; with `full`, all lines with every setting of the solver. A bench with some lines leaves out new
+    ground and the score, and other solvers unless `full`. Print the result, then write stress_<physics>.json and .png. Return
+    the exit code.
+
+    Raises:
+        RunError: a file can't be written.
+    """
+    start = time.perf_counter()
+    setting = bench.setting
+    engine = setting.engine
+    print(f"{len(bench.rows)} lines x {bench.robots} robots, in {engine}", flush=True)
+    lines = bench.measure(bench.rows)
+    ground = bench.on_new_ground() if bench.whole and not bench.on_plane else {}
+    few = [row for row in bench.rows if full or row.name in SETTING_LINES]
+    others = {}
+    tried = settings(bench.cfg, engine) if full or bench.whole else {}
+    if tried and HALF_STEP not in tried:
+        print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows its own alone", flush=True)
+    for name, changes in tried.items():
+        print(f"{name}: {len(few)} lines", flush=True)
+        others[name] = bench.measure(few, changes)
+    result = {
+        **setting.head,
+        "wall_s": time.perf_counter() - start,
+        "changes": {key: value for key, value in setting.overrides if key != "sim.physics"},
+        "definition": {
+            "riser_m": bench.riser,
+            "tread_m": bench.tread,
+            "robots_per_line": bench.robots,
+            "time_s": TIME_S,
+            "vx": FORWARD * bench.scale**0.5,
+            "hold_s": HOLD_S,
+            "measured_s": HOLD_S - SETTLE_S,
+            "limit": bench.limit,
+            "interval": "Wilson 95 %; of the score: mean of such shares (Zou and Donner)",
+        },
+        "score": score(lines, ground) if bench.whole else None,
+        "lines": lines,
+        "ground": ground,
+        "settings": others,
+        "contact_overflows": bench.lost,
+    }
+    print_stress(result)
+    warn_of_overflows("stress", bench.lost)
+    path = setting.folder / stress_name(engine)
+    write_result(path, result)
+    draw_stress(result, path.with_suffix(".png"))
+    print(f"written: {relative(path)}, {relative(path.with_suffix('.png'))}")
+    return 0
+
+
+def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
+    """Return the rows of the table: kind (of COLORS), name, description, and figures of success and of the flat."""
+    named = [("combined" if line["name"] in COMBINED else "table", line["name"], line) for line in result["lines"]]
+    for name, lines in result["settings"].items():
+        named += [("settings", f"{name}: {line['name']}", line) for line in lines]
+    rows = [(kind, name, line["what"], line.get("stairs"), line["flat"]) for kind, name, line in named]
+    for name, entry in result["ground"].items():
+        what = f"{entry['what']} {entry['size']:.3g} {entry['unit']}"
+        rows.append(("ground", f"{name.replace('_', ' ')}, {entry['size']:.3g} {entry['unit']}", what, entry, None))
+    return rows
+
+
+def score_text(result: dict[str, Any]) -> str:
+    """Return the score as text."""
+    found, rule = result["score"], result["definition"]
+    if found is None:
+        return f"stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in result["lines"][0] else "on the flat"
+    parts = ", ".join(f"{name} {100 * found[name]:.0f} %" for name in ("stairs", "flat", "ground") if name in found)
+    stairs = f"; stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in found else ""
+    low, high = (100 * found[end] for end in ("low", "high"))
+    return f"stress score {100 * found['value']:.1f} % ({low:.1f} to {high:.1f} %): {parts}{stairs}"
+
+
+def print_stress(result: dict[str, Any]) -> None:
+    """Print a table with a line for each disturbance, setting and ground, then the score."""
+    limit, last = result["definition"]["limit"], "table"
+    rows: list[list[str] | None] = []
+    for kind, name, what, stairs, flat in rows_of(result):
+        rows += [None] if kind != last else []
+        last = kind
+        error = "none" if flat and flat["rmse_lin"] is None else f"{flat['rmse_lin']:.3f} m/s" if flat else ""
+        up = [share_text(stairs), str(stairs["fell"]), str(stairs["stuck"])] if stairs else ["", "", ""]
+        level = [share_text(flat), str(flat["fell"]), error] if flat else ["", "", ""]
+        rows.append([f"{name}: {what}" if kind == "table" and name != NOMINAL.name else name, *up, *level])
+    heads = ["success on stairs\nor new ground", "fell", "stuck"]
+    heads += [f"on the flat, error\nbelow {limit:.3g} m/s", "fell", "RMSE"]
+    table = screen_table(f"{result['task']} ({result['checkpoint']}) in {result['physics']}", ["disturbance", *heads], rows)
+    table.columns[0].max_width = 48
+    Console(width=130).print(table)
+    print(score_text(result))
+
+
+def share_text(entry: dict[str, Any]) -> str:
+    """Return a share with its interval as text: '97 % (84 to 99)'."""
+    return f"{100 * entry['share']:.0f} % ({100 * entry['low']:.0f} to {100 * entry['high']:.0f})"
+
+
+def draw_stress(result: dict[str, Any], path: Path) -> None:
+    """Draw a bar a line, with its interval: success, commands followed on the flat, and the velocity error there."""
+    rows = rows_of(result)
+    names = [name for _, name, *_ in rows]
+    colors = [COLORS[kind] for kind, *_ in rows]
+    limit = result["definition"]["limit"]
+    with figure(path, (12.5, 1.7 + 0.3 * len(rows)), columns=3, share_y=True) as (drawn, axes):
+        from matplotlib.patches import Patch
+
+        places = list(range(len(rows)))
+        for axis, column, label in ((axes[0, 0], 3, "success"), (axes[0, 1], 4, f"flat: stood, error below {limit:.3g} m/s")):
+            there = [place for place in places if rows[place][column]]
+            entries: list[Any] = [rows[place][column] for place in there]
+            ends = [[100 * abs(one[end] - one["share"]) for one in entries] for end in ("low", "high")]
+            look = {"xerr": ends, "error_kw": {"elinewidth": 1.0, "ecolor": "0.25", "capsize": 2}}
+            axis.barh(there, [100 * one["share"] for one in entries], color=[colors[place] for place in there], **look)
+            axis.set_xlim(0.0, 102.0)
+            axis.set_xlabel(f"{label} [% of robots]")
+        flat = [(place, row[4]["rmse_lin"], color) for place, row, color in zip(places, rows, colors, strict=True) if row[4]]
+        axes[0, 2].barh([one[0] for one in flat], [one[1] or 0.0 for one in flat], color=[one[2] for one in flat])
+        axes[0, 2].axvline(limit, color="0.25", ls=":", lw=1.4)
+        axes[0, 2].set_xlabel("flat: RMSE of the velocity [m/s]")
+        for axis in axes[0]:
+            axis.spines[["top", "right"]].set_visible(False)
+            axis.grid(axis="x", alpha=0.3)
+            axis.set_axisbelow(True)
+        axes[0, 0].set_yticks(places, names)
+        axes[0, 0].set_ylim(len(rows) - 0.4, -0.6)
+        kinds = dict.fromkeys(kind for kind, *_ in rows)
+        keys = [Patch(color=COLORS[kind], label=LABELS[kind]) for kind in kinds]
+        drawn.legend(handles=keys, loc="outside lower center", ncols=len(keys), frameon=False)
+        drawn.suptitle(f"{result['task']} in {result['physics']}: {score_text(result)}", fontsize="medium")

@@ -189,7 +189,7 @@ def test_a_chart_is_a_panel_of_a_picture(tmp_path):
     """Three panels take two rows; each line has its colour, and a single point is a marker with its interval."""
     point = Line("point", np.array([0.2]), np.array([0.5]), (np.array([0.4]), np.array([0.7])), markers=True)
     lines = [Line("a", np.arange(3.0), np.ones(3)), Line("b", np.arange(3.0), np.array([0.0, np.nan, 2.0]))]
-    one, two = Chart("x", "iteration", lines), Chart("y", "size", [point], high=1.0, percent=True, walls=(("end", 0.3),))
+    one, two = Chart("x", "iteration", lines), Chart("y", "size", [point], percent=True, walls=(("end", 0.3),))
     low = drawn(one, two, path=tmp_path / "low.png")
     high = drawn(one, two, one, path=tmp_path / "high.png", iteration_s=2.0)
     assert high.shape[0] > 1.8 * low.shape[0]

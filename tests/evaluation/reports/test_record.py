@@ -43,7 +43,12 @@ def times(**other) -> Timing:
 def test_a_run_that_came_to_its_end():
     record = read_record(tiny_run("train.runner.run_name=short", iterations=3))
     assert (record.status, record.why, record.done) == ("finished", "3 of 3 iterations", 3)
-    assert (record.task, record.run_name, record.robots, record.steps_per_iteration) == (TASK, "short", 8, 32)
+    assert (record.task, record.at("train.runner.run_name"), record.robots, record.steps_per_iteration) == (
+        TASK,
+        "short",
+        8,
+        32,
+    )
     assert record.log.dt == pytest.approx(0.02)
     assert record.problems == ()
     assert abs(record.began.timestamp() - time.time()) < 300

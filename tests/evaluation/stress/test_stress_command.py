@@ -1,6 +1,7 @@
 """`legged evaluate stress`: its files, where its robots are, and its errors."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +10,14 @@ from helpers import ENGINE, POLICY, call, kept_global_state, tiny_run
 
 from legged.cli.evaluate import stress
 from legged.evaluation import success
+from legged.evaluation.measurement import Setting
 from legged.evaluation.stress import measuring
-from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench, Wish
-from legged.evaluation.stress.table import ALONE, Disturbance
+from legged.evaluation.stress.disturbances import ALONE, Disturbance
+from legged.evaluation.stress.measuring import GROUND, STAIRS, Bench
 from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
 
-make = measuring._make
+make = measuring.make_stressed
 pytestmark = pytest.mark.usefixtures("workplace")
 FLAGS = ["--physics", "mujoco", "sim.threads=1"]
 LINES = 1 + len(ALONE) + 2
@@ -29,6 +31,10 @@ def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, kept_global_state():
         patch.chdir(folder)
         return folder / tiny_run("--task", "anymal_c", *small, num_envs=20, iterations=1)
+
+
+def setting_of(run, overrides=ENGINE) -> Setting:
+    return Setting(policy_of(str(run)), torch.device("cpu"), Path(), overrides, graph=False)
 
 
 @pytest.fixture
@@ -75,7 +81,7 @@ def test_the_stress_test_writes_a_table_and_a_picture(trained, short, tmp_path, 
 def test_some_lines_are_measured_alone_at_solver_settings_of_one_s_own(trained, short, tmp_path, capsys, monkeypatch):
     """Both the lines and, with --full, the other solvers; those are others than the one that was asked for."""
     steps = []
-    monkeypatch.setattr(measuring, "_make", lambda *given: steps.append(given[1].sim.dt) or make(*given))
+    monkeypatch.setattr(measuring, "make_stressed", lambda *given: steps.append(given[1].sim.dt) or make(*given))
     arguments = [str(trained), "--robots-per-point", "2", "--lines", "nominal, together"]
     own = ["sim.dt=0.004", "control.decimation=5", "sim.cone=elliptic"]
     assert call(stress.main, [*arguments, *FLAGS, *own, "--out", str(tmp_path / "a")]) == 0
@@ -104,7 +110,7 @@ def test_a_policy_of_a_plane_is_stressed_on_the_flat_only(short, tmp_path):
 
 def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
     """Two lines of four robots: of the first, those that go up get out; of the second, those that go down fall."""
-    bench = Bench(policy_of(str(trained)), 4, Wish(tread=0.3, payload=3.0), ENGINE, torch.device("cpu"), False)
+    bench = Bench(setting_of(trained), 4, tread=0.3, payload=3.0)
     assert (bench.riser, bench.limit, bench.on_plane) == (0.17, 0.25, False)
     assert [row.payload for row in bench.rows if row.payload] == [3.0] * 3  # alone, together, everything
     seen = {}
@@ -134,7 +140,7 @@ def test_half_of_a_lines_robots_go_up_and_the_others_down(trained, monkeypatch):
 def test_what_is_asked_of_ground_and_grid_counts_for_what_is_measured(trained, monkeypatch):
     """Stairs, distances and limits of the scale that is asked for, in cells that divide the tread; commands of its grid."""
     asked = [*ENGINE, ("terrain.scale", 0.5), ("terrain.horizontal_scale", 0.1), ("evaluation.vx", [-0.3, 0.6, 0.3])]
-    bench = Bench(policy_of(str(trained)), 2, Wish(), asked, torch.device("cpu"), False)
+    bench = Bench(setting_of(trained, asked), 2)
     assert (bench.riser, bench.limit) == (0.085, pytest.approx(0.25 * 0.5**0.5))
     seen = {}
 
@@ -161,7 +167,7 @@ def test_what_is_asked_of_ground_and_grid_counts_for_what_is_measured(trained, m
 
 
 def test_robots_take_turns_at_commands_within_the_tasks_grid(trained, monkeypatch):
-    bench = Bench(policy_of(str(trained)), 9, Wish(), ENGINE, torch.device("cpu"), False)
+    bench = Bench(setting_of(trained), 9)
     seen = {}
 
     def look(task, act, commands):

@@ -9,8 +9,8 @@ from helpers import small_config
 
 from legged.config import override
 from legged.evaluation.intervals import mean_of_shares, wilson
+from legged.evaluation.stress.disturbances import ALONE, NOMINAL, Disturbance, combined, scaled, table
 from legged.evaluation.stress.measuring import STAIRS, followed, score, settings
-from legged.evaluation.stress.table import ALONE, NOMINAL, Disturbance, combined, scaled, table
 from legged.evaluation.success import to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.mdp.actuator_network import NetworkWeights
@@ -74,14 +74,14 @@ def test_stairs_have_the_risers_and_treads_that_are_asked_for(task, riser):
 
 def test_solvers_that_are_tried():
     cfg = small_config()
-    found = {one.name: dict(one.changes) for one in settings(cfg, "mujoco")}
+    found = {name: dict(changes) for name, changes in settings(cfg, "mujoco").items()}
     assert found["half the time step"] == {"sim.dt": 0.0025, "control.decimation": 8}
     late = override(cfg, [("control.actuator.delay", [1, 6])])
-    halved = dict(settings(late, "mujoco")[0].changes)
+    halved = dict(settings(late, "mujoco")["half the time step"])
     assert halved["control.actuator.delay"] == [2, 12]  # counted in physics steps, which are half as long
     assert found["elliptic cones"] == {"sim.cone": "elliptic"}
     assert found["impratio 100"] == {"sim.impratio": 100.0, "sim.iterations": 50}
-    assert [one.name for one in settings(cfg, "newton_xpbd")] == ["half the time step"]
+    assert list(settings(cfg, "newton_xpbd")) == ["half the time step"]
 
 
 def test_the_time_step_is_not_halved_of_motors_that_know_their_own_alone(tmp_path):
@@ -94,8 +94,8 @@ def test_the_time_step_is_not_halved_of_motors_that_know_their_own_alone(tmp_pat
         learned = override(small_config(), [("control.actuator.network", str(file))])
         found = settings(learned, "mujoco")
         assert len(found) == tried
-        for one in found:  # every one of them can be built
-            task_class(learned.task).check(override(learned, one.changes))
+        for changes in found.values():  # every one of them can be built
+            task_class(learned.task).check(override(learned, changes))
 
 
 def test_who_has_followed_a_command():

@@ -7,8 +7,7 @@ import torch
 from helpers import CALM, ENGINE, JOINTS, TASK, small_config, small_task, zero_actions
 
 from legged.config import override
-from legged.evaluation.stress.stressed_task import declared, make_stressed
-from legged.evaluation.stress.table import NOMINAL, PUSH_INTERVAL, Disturbance
+from legged.evaluation.stress.disturbances import NOMINAL, PUSH_INTERVAL, Disturbance, declared, make_stressed
 from legged.evaluation.tiles import on_terrain
 from legged.mdp.control import control_gains
 from legged.physics import FIELDS, RobotScene
@@ -21,7 +20,7 @@ AT_REST = [("init_state.dof_pos_factor", [1.0, 1.0]), ("init_state.base_velocity
 def stressed(*rows, terrain=None, changes=()):
     """A task of robots that begin alike, each with its disturbance."""
     cfg = override(small_config(*AT_REST, *changes, num_envs=len(rows)), declared(rows))
-    return make_stressed(cfg, rows, torch.device("cpu"), False, terrain)
+    return make_stressed(rows, cfg, torch.device("cpu"), False, terrain)
 
 
 def with_nominal(**disturbance):
@@ -152,7 +151,7 @@ def on_steps(*rows):
     cfg = task_config("anymal_c", [("env.num_envs", len(rows)), *ENGINE, *CALM, *AT_REST, *exact], on_cpu=True)
     cfg = override(cfg, [*on_terrain(cfg, 8.0, 0.0), *declared(rows)])
     terrain = Terrain.of_tiles([[TileSpec("stairs_up", 0.2, tread=0.3)]], cfg.terrain, None)
-    return make_stressed(cfg, rows, torch.device("cpu"), False, terrain)
+    return make_stressed(rows, cfg, torch.device("cpu"), False, terrain)
 
 
 def move(task, by):
@@ -237,7 +236,7 @@ def test_what_else_is_drawn_differs_from_robot_to_robot_beside_the_rows():
     """The user asks for it after what the rows need."""
     rows = [NOMINAL, Disturbance("one", payload=4.0)]
     cfg = override(small_config(num_envs=2), [*declared(rows), ("domain_rand.ranges.p_gain", [0.5, 0.6])])
-    task = make_stressed(cfg, rows, torch.device("cpu"), False, None)
+    task = make_stressed(rows, cfg, torch.device("cpu"), False, None)
     share = task.control.stiffness / torch.tensor(control_gains(task.robot, cfg.control)[0])
     assert bool(((share >= 0.5) & (share <= 0.6)).all())
     assert share[0, 0] != share[1, 0]

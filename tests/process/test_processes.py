@@ -3,8 +3,8 @@
 import signal
 import sys
 
+from legged.process.processes import BUILT, Job, Kind, WorkerPool, why_failed
 from legged.process.startup import STAGES_FILE
-from legged.process.worker_pool import BUILT, Job, Kind, WorkerPool, why_failed
 
 
 def script(kind, name, log, built_after=0.0, lasts=0.3, code="", done=lambda job, code: []):

@@ -1,15 +1,15 @@
-"""Turn a URDF or MJCF file into a robot and a task: `legged robot add my_robot.urdf`.
-
-The command writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task on flat ground, and prints what it
-guessed.
-"""
+"""`legged robot`: make robots from files, and show them."""
 
 import argparse
 import shlex
 import sys
 from pathlib import Path
 
-from legged.commandline.command import command
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
 from legged.process.command_parser import CommandParser
@@ -26,14 +26,7 @@ ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged robot add",
-        __doc__,
-        "legged robot add path/to/my_robot.urdf --out mine",
-        "legged robot add menagerie:unitree_go2 --name my_go2",
-    )
+def _add_arguments(parser: CommandParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME")
     parser.add_argument("--name", help="of the robot; that of the file by default")
     parser.add_argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default")
@@ -43,13 +36,19 @@ def build_parser() -> CommandParser:
     parser.add_argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default")
     parser.add_argument("--damping", type=float, help="D gain of all joints [N m s/rad]")
     parser.add_argument("--force", action="store_true", help="write over a robot of that name")
-    return parser
 
 
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_args(argv)
+@sub_command(
+    "legged robot add path/to/my_robot.urdf --out mine",
+    "legged robot add menagerie:unitree_go2 --name my_go2",
+    add=_add_arguments,
+)
+def add(args: argparse.Namespace) -> int:
+    """Turn a URDF or MJCF file into a robot and a task: `legged robot add my_robot.urdf`.
+
+    The command writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task on flat ground, and prints what it
+    guessed.
+    """
     gains = _gains(args)
     path, source, licence = _source(args.source)
     name = args.name or plain(Path(args.source.removeprefix(PREFIX)).stem).lower()
@@ -150,3 +149,42 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
     print(f"  default pose [rad]: {angles or 'all 0'}")
     meshes = f", {megabytes:.1f} MiB of meshes" if megabytes else ""
     print(f"written: {relative(folder)}/ ({tree.name}.xml, robot.yaml, PROVENANCE.md{meshes}) and {relative(task)}")
+
+
+@sub_command(
+    "legged robot show go2",
+    "legged robot show mine/my_robot",
+    add=lambda parser: parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
+)
+def show(args: argparse.Namespace) -> int:
+    """Print joints, limits, gains and feet of a robot: `legged robot show go2`.
+
+    The numbers are those of the robot's folder, as every task with this robot begins with them.
+    """
+    robot = load_robot(args.robot, "ROBOT")
+    print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")
+    table = Table(
+        *(
+            "joint",
+            "default [rad]",
+            "range [rad]",
+            "velocity [rad/s]",
+            "torque [N m]",
+            "stiffness",
+            "damping",
+            "rotor [kg m^2]",
+        )
+    )
+    for i, name in enumerate(robot.joint_names):
+        low, high = robot.dof_pos_limits[i]
+        numbers = (robot.dof_vel_limits, robot.torque_limits, robot.stiffness, robot.damping, robot.armature)
+        values = [f"{values[i]:.4g}" if np.isfinite(values[i]) else "-" for values in numbers]
+        table.add_row(name, f"{robot.default_dof_pos[i]:.4g}", f"{low:.4g} to {high:.4g}", *values)
+    Console(width=130).print(table)
+    for what, names in (
+        ("feet", robot.feet_names),
+        ("contact is penalised", [robot.contact_names[i] for i in robot.penalised_indices]),
+        ("contact ends an episode", [robot.contact_names[i] for i in robot.termination_indices]),
+    ):
+        print(f"{what}: {', '.join(names) or 'none'}")
+    return 0

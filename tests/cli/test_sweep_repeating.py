@@ -5,7 +5,7 @@ import threading
 import pytest
 from helpers import HANG_S
 
-from legged.process.repeating import repeating
+from legged.sweeping.trials import repeating
 
 
 @pytest.mark.parametrize("at_end", [False, True])

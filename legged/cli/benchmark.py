@@ -1,0 +1,542 @@
+"""`legged benchmark`: times of control steps, of training iterations and of a start."""
+
+import argparse
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
+from functools import partial
+from pathlib import Path
+from statistics import median
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
+from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY, sub_command
+from legged.config import LeggedConfig, TaskConfig, override
+from legged.config.networks import learns_from_teacher
+from legged.envs import BaseTask
+from legged.errors import ConfigError, RunError
+from legged.graph.step_graph import StepGraph
+from legged.learning.captured import CapturedRunner
+from legged.learning.checkpoint import check_fits, read_checkpoint
+from legged.learning.display import Progress
+from legged.learning.runner import Runner
+from legged.learning.student_runner import StudentRunner
+from legged.learning.teacher import Teacher, find_teacher, with_teacher
+from legged.physics import resolve_physics
+from legged.policies.actor import Actor
+from legged.policies.restore import policy_of
+from legged.process.command_parser import CommandParser
+from legged.process.paths import make_folder, ready_to_write, relative, write_text
+from legged.process.startup import STAGES_FILE
+from legged.registry import make_task, task_config
+
+RESULT = "benchmark.json"
+KERNEL_STEPS = 20
+"""Number of control steps whose kernels --kernels times."""
+GROUNDS: dict[str, list[tuple[str, Any]]] = {
+    "plane": [("terrain.mesh_type", "plane")],
+    "terrain, our collider": [("sim.terrain_collider", "cells")],
+    # The general collider needs room for its candidate pairs and for more contacts.
+    "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
+}
+KILLED = -9
+"""Exit code of a process that Linux ended because memory ran out."""
+NO_ROOM = "out of memory"
+"""Result of a size that does not fit into memory."""
+COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
+    ("robots", 12, lambda row: f"{row['num_envs']:,}"),
+    ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
+    ("steps/s", 13, lambda row: f"{row['env_steps_per_s']:,.0f}"),
+    ("iteration", 13, lambda row: f"{row['iteration_ms']:.1f} ms" if "iteration_ms" in row else "-"),
+    ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
+    ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
+)
+"""Columns of the table: heading, width, text."""
+ENDS = "first iteration"
+CAPTURES = ("step captured", "training captured")
+"""Stages that end when a CUDA graph is captured, or on the CPU when the step is checked."""
+Turn = tuple[Callable[[], object], Callable[[], object]]
+"""Untimed preparation, and the timed function."""
+LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
+"""Training loops by name."""
+
+
+def _add_arguments(parser: CommandParser) -> None:
+    add_task_arguments(parser)
+    parser.add_argument(
+        "--repeats", type=int, default=5, help="number of measurements; the result is their median; 5 by default"
+    )
+    parser.add_argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written")
+
+
+def _add_steps(parser: CommandParser) -> None:
+    _add_arguments(parser)
+    parser.add_argument("--steps", type=int, default=200, help="control steps a measurement; 200 by default")
+
+
+def _add_step_arguments(parser: CommandParser) -> None:
+    """Add the options that choose the timed steps and iterations."""
+    _add_steps(parser)
+    parser.add_argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none")
+    parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
+    parser.add_argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it")
+
+
+def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
+    """Check the arguments that commands share; return the configuration and the device."""
+    register_given(args, "task")
+    device = pick_device(args.sim_device)
+    cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
+    for name, least in (("steps", 1), ("repeats", 1), ("iterations", 0), ("kernels", 1)):
+        value = getattr(args, name, None)
+        if value is not None and value < least:
+            raise ConfigError(f"--{name}: must be at least {least}, got {value}")
+    if args.out is not None:
+        ready_to_write(args.out)
+    return cfg, device
+
+
+def _measure(
+    cfg: TaskConfig, device: torch.device, args: argparse.Namespace, policy: Path | None = None
+) -> tuple[Any, dict[str, Any]]:
+    """Build a task and time its steps, under a checkpoint's policy or random actions; return the task and the figures."""
+    start = time.perf_counter()
+    task = make_task(cfg, device, graph=not args.no_graph)
+    synchronize(device)
+    build_s = time.perf_counter() - start
+    actor = None
+    if policy is not None:
+        actor = Actor(task, device)
+        actor.load(policy)
+    result = {**time_steps(task, args.steps, args.repeats, actor), "build_s": build_s}
+    return task, result if policy is None else {**result, "policy": relative(policy)}
+
+
+def _add_memory(result: dict[str, Any], device: torch.device) -> None:
+    """Add the GPU memory in use to a result."""
+    if device.type == "cuda":
+        free, whole = torch.cuda.mem_get_info(device)
+        result["gpu_memory_gib"] = (whole - free) / 2**30
+
+
+def without(given: Sequence[str], *flags: str) -> list[str]:
+    """Return a command line without some options and their values."""
+    own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for flag in flags:
+        own.add_argument(flag)
+    return own.parse_known_args(list(given))[1]
+
+
+def _last_line(text: str, code: int) -> str:
+    """Return the last line of a process's error output, its reason to end with `code`."""
+    return (text.strip().splitlines() or [f"exit code {code}"])[-1].removeprefix("error: ")
+
+
+def _write(args: argparse.Namespace, result: Any) -> None:
+    """Write a result into the folder of --out, if one was given."""
+    if args.out is not None:
+        make_folder(args.out)
+        write_text(args.out / RESULT, json.dumps(result, indent=1))
+
+
+def _add_kernels(parser: CommandParser) -> None:
+    _add_step_arguments(parser)
+    parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
+
+
+@sub_command(
+    "legged benchmark step anymal_c_flat --runner captured --out times",
+    "legged benchmark step go2 --num-envs 8192 --policy go2",
+    add=_add_kernels,
+)
+def step(args: argparse.Namespace) -> int:
+    """Time a control step, the physics in it, and training iterations: `legged benchmark step anymal_c_flat`.
+
+    Random actions move the robots, or a policy with `--policy`. Robots that flail under random actions need more solver
+    rounds where their physics is randomised or has dry friction. On a GPU the timed steps run under torch's sync debug mode
+    "error", which raises at any synchronisation with the host.
+    """
+    cfg, device = _settle(args)
+    if args.kernels is not None and device.type != "cuda":
+        raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
+    if args.kernels is not None and args.policy is not None:
+        raise ConfigError("--kernels: lists what is launched under random actions; leave it or --policy out")
+    settle_on(device)
+    count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
+    policy = None
+    if args.policy is not None:
+        policy = policy_of(args.policy, where="--policy").checkpoint
+        check_fits(policy, read_checkpoint(policy), cfg)
+    teacher = find_teacher(cfg) if learns_from_teacher(cfg) and count > 0 else None
+    task, result = _measure(cfg if teacher is None else with_teacher(cfg, teacher), device, args, policy)
+    if args.kernels is not None:
+        result["kernels"] = kernel_times(task, KERNEL_STEPS)
+        print(kernel_table(result["kernels"], args.kernels), flush=True)
+    if count > 0:
+        loops = loops_of(task.cfg, teacher, args.runner)
+        result["iterations"] = {loop: time_iterations(kind, task, count) for loop, kind in loops.items()}
+    _add_memory(result, device)
+    print(report(task, result), flush=True)
+    _write(args, result)
+    return 0
+
+
+def _add_robots(parser: CommandParser) -> None:
+    _add_step_arguments(parser)
+    parser.add_argument("--robots", required=True, help="numbers of robots, e.g. 1024,4096,16384")
+
+
+@sub_command(
+    "legged benchmark scale anymal_c --robots 1024,4096,16384",
+    "legged benchmark scale go2_flat --robots 256,1024 --iterations 0 --out times",
+    add=_add_robots,
+)
+def scale(args: argparse.Namespace) -> int:
+    """Measure speed and memory against the number of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
+
+    Each number is measured as by `legged benchmark step`, in a process of its own, so that each has the memory to itself.
+    """
+    sizes = [part.strip().replace("_", "") for part in args.robots.split(",")]
+    if not all(size.isdecimal() and int(size) > 0 for size in sizes):
+        raise ConfigError(f"--robots: '{args.robots}' is not a list of numbers of robots, like 1024,4096,16384")
+    if args.num_envs is not None:
+        raise ConfigError("--num-envs: --robots names all numbers of robots; leave it out")
+    cfg, device = _settle(args)
+    loop = args.runner or cfg.train.runner.loop
+    given = without(args.words, "--robots", "--out", "--num-envs", "--runner")
+    result = {"task": cfg.task, "device": device_name(device), "loop": loop}
+    print(f"{cfg.task}, {result['device']}, {loop} training", flush=True)
+    print("".join(f"{name:>{width}}" for name, width, _ in COLUMNS), flush=True)
+    rows = []
+    for size in sizes:
+        rows.append(_measure_apart(given, int(size), loop))
+        failed = rows[-1].get("failed")
+        shown = COLUMNS if failed is None else COLUMNS[:1]
+        line = "".join(f"{text(rows[-1]):>{width}}" for _, width, text in shown)
+        print(line if failed is None else f"{line}  {failed}", flush=True)
+    _write(args, result | {"sizes": rows})
+    return int(any(row.get("failed", NO_ROOM) != NO_ROOM for row in rows))
+
+
+def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
+    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if they are missing.
+    ConfigError: the configuration does not allow so many robots.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        words = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
+        words += ["--num-envs", str(size), "--runner", loop, "--out", folder]
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        if done.returncode == EXIT_WRONG_INPUT:
+            raise ConfigError(_last_line(done.stderr, done.returncode))
+        if done.returncode == KILLED or (done.returncode and LACKS_MEMORY.search(done.stderr)):
+            return {"num_envs": size, "failed": NO_ROOM}
+        if done.returncode:
+            print(done.stderr, file=sys.stderr)
+            return {"num_envs": size, "failed": _last_line(done.stderr, done.returncode)}
+        result = json.loads((Path(folder) / RESULT).read_text(encoding="utf-8"))
+    iterations = result.pop("iterations", {}).get(loop, {})
+    return {**result, **iterations}
+
+
+@sub_command(
+    "legged benchmark ground anymal_c",
+    "legged benchmark ground go2 --num-envs 2048 --out times",
+    add=_add_steps,
+)
+def ground(args: argparse.Namespace) -> int:
+    """Measure speed on different ground: `legged benchmark ground anymal_c`.
+
+    The task is timed on a plane, on its terrain with this package's collider, and on its terrain with mujoco-warp's general
+    one.
+    """
+    cfg, device = _settle(args)
+    where = cfg.origins.where("sim.physics")
+    if resolve_physics(cfg.sim.physics, device, where, cfg.env.num_envs) != "mujoco_warp":
+        raise ConfigError(f"{where}: colliders of mujoco_warp are compared; add sim.physics=mujoco_warp")
+    if not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane":
+        raise ConfigError(f"TASK: '{cfg.task}' has no terrain")
+    settle_on(device)
+    results = {}
+    for name, changes in GROUNDS.items():
+        task, results[name] = _measure(override(cfg, changes), device, args)
+        _add_memory(results[name], device)
+        print(f"{name}: {report(task, results[name])}", flush=True)
+    _write(args, results)
+    return 0
+
+
+@sub_command(
+    "legged benchmark startup anymal_c_flat",
+    "legged benchmark startup go2 --repeats 3 --out times",
+    add=_add_arguments,
+)
+def startup(args: argparse.Namespace) -> int:
+    """Time a training until it begins: `legged benchmark startup anymal_c_flat`.
+
+    A training is started in a process of its own and ended after its first iteration. The seconds at which each stage of the
+    start ended are printed, next to those that `import torch` alone takes.
+    """
+    _settle(args)
+    times = _time_start(args.words, args.repeats)
+    print(f"import torch: {times['torch_s']:.2f} s\na training, seconds since its process was started:")
+    print(*(f"  {seconds:7.2f}  {name}" for name, seconds in times["stages"].items()), sep="\n")
+    print(
+        f"to the first iteration: {times['ratio']:.2f} x import torch; less {times['capture_s']:.2f} s of capturing graphs:"
+        f" {times['ratio_without_capture']:.2f} x",
+        flush=True,
+    )
+    _write(args, times)
+    return 0
+
+
+def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
+    """Return medians of `repeats` runs, after one run that fills caches: `torch_s`, the time of `import torch`; `stages`, the
+    end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`; the `ratio` of
+    the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
+    """
+    training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
+    runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]
+    torch_s = median(alone["end"] for alone, _ in runs)
+    stages = {name: median(stages[name] for _, stages in runs) for name in runs[0][1]}
+    names = list(stages)
+    capture_s = sum(stages[name] - stages[names[names.index(name) - 1]] for name in CAPTURES if name in stages)
+    return {
+        "torch_s": torch_s,
+        "stages": stages,
+        "capture_s": capture_s,
+        "ratio": stages[ENDS] / torch_s,
+        "ratio_without_capture": (stages[ENDS] - capture_s) / torch_s,
+    }
+
+
+def _run(*arguments: str) -> dict[str, float]:
+    """Run Python in an empty folder; return the end of each stage of a start, and of the process as `end` [s]."""
+    with tempfile.TemporaryDirectory() as folder, tempfile.NamedTemporaryFile("r", encoding="utf-8") as file:
+        # Where this package is not installed, the process finds it as this one did, and so user-defined modules.
+        path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
+        environment = os.environ | {"PYTHONPATH": path, STAGES_FILE: file.name}
+        start = time.time()
+        done = subprocess.run(
+            [sys.executable, *arguments], capture_output=True, text=True, check=False, cwd=folder, env=environment
+        )
+        end = time.time()
+        lines = file.read().splitlines()
+    if done.returncode:
+        raise RunError(f"startup: {_last_line(done.stderr, done.returncode)}")
+    return {name: float(when) - start for when, name in (line.split(" ", 1) for line in lines)} | {"end": end - start}
+
+
+# ---- measurements ----------------------------------------------------------------------------------------------------
+
+
+class Driver:
+    """Source of the robots' actions, random or from a policy; its time is not measured."""
+
+    def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor] | None) -> None:
+        """Use the policy `act`, observations -> actions, or random actions without one."""
+        self._task, self._act = task, act
+        self._table = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=torch.device(task.device))
+        self._made = 0
+        self._kept: dict[str, Tensor] = {}
+        self.actions = torch.zeros_like(self._table[0])
+        """(N, D) actions of the next control step."""
+
+    def decide(self) -> None:
+        """Choose the `actions` of the next control step."""
+        self.put_back()
+        random = self._table[self._made % len(self._table)]
+        self.actions.copy_(random if self._act is None else self._act(self._task.get_observations()))
+        self._made += 1
+
+    def keep(self) -> None:
+        """Store the physics' state if a policy acts: the policy must not meet motion that it did not command."""
+        if self._act is not None:
+            self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
+
+    def put_back(self) -> None:
+        """Restore the state of the last `keep`."""
+        if self._kept:
+            self._task.physics.load_state(self._kept)
+
+
+@torch.inference_mode()
+def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
+    """Return milliseconds per control step: of the task's step, and of its physics alone, under random actions or those of a
+    policy `act`, observations -> actions.
+
+    Physics alone is `decimation` engine steps of the same model under the present torques. On a GPU it is one graph too. If
+    the task's step consists of mujoco-warp's parts, as many of mujoco-warp's own steps are timed as well. All are timed in
+    turns, step by step, so that they meet the states, contacts and clock rates of a rollout: without a controller or resets,
+    the physics would soon simulate heaps of fallen robots.
+    """
+    device = torch.device(task.device)
+    driver = Driver(task, act)
+    for _ in range(50):  # robots land and spread over the states of a training
+        driver.decide()
+        task.step(driver.actions)
+    steps_of = {"physics": task.physics.step}
+    library = task.physics.library_step
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # it takes minutes on a CPU
+        steps_of["library"] = library
+    alone = {name: _control_period(task, step) for name, step in steps_of.items()}
+    turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]
+    turns += [(driver.put_back if k else driver.keep, run) for k, run in enumerate(alone.values())]
+    results = [_time_in_turns(turns, steps, device) for _ in range(repeats)]
+    driver.put_back()
+    times: dict[str, Any] = {"num_envs": task.num_envs}
+    for name, measured in zip(("control_step", *alone), map(sorted, zip(*results, strict=True)), strict=True):
+        times |= {f"{name}_ms": median(measured), f"{name}_ms_range": [measured[0], measured[-1]]}
+    return {
+        **times,
+        "ratio": times["control_step_ms"] / times["physics_ms"],
+        "env_steps_per_s": task.num_envs / times["control_step_ms"] * 1e3,
+        "captured": float(task.captured),
+        "overflows": float(task.metrics.flush()["Metrics/contact_overflows"]),
+    }
+
+
+def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], None]:
+    """Return a function that makes the engine steps of one control step; it is a CUDA graph if the task's step is one."""
+
+    def run() -> None:
+        for _ in range(task.cfg.control.decimation):
+            step()
+
+    return StepGraph(run, torch.device(task.device), enabled=True) if task.captured else run
+
+
+def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> list[float]:
+    """Return mean milliseconds per call of each turn's timed function. On a GPU, waiting for the host raises an error."""
+    on_gpu = device.type == "cuda"
+
+    def mark() -> Any:
+        if not on_gpu:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+    synchronize(device)
+    spans: list[list[tuple[Any, Any]]] = [[] for _ in turns]
+    try:
+        if on_gpu:
+            torch.cuda.set_sync_debug_mode("error")
+        for _ in range(steps):
+            for (prepare, function), measured in zip(turns, spans, strict=True):
+                prepare()
+                first = mark()
+                function()
+                measured.append((first, mark()))
+    finally:
+        if on_gpu:
+            torch.cuda.set_sync_debug_mode("default")
+    synchronize(device)
+    times = [[a.elapsed_time(b) if on_gpu else 1e3 * (b - a) for a, b in measured] for measured in spans]
+    return [sum(each) / steps for each in times]
+
+
+def device_name(device: torch.device) -> str:
+    """Return the name of a device in results."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a GPU has finished its work."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
+    """Return the runners to time, by name of the loop: the loop `asked`, or else all. Students of a `teacher` and policies
+    with an estimator have only the loop of the configuration.
+    """
+    own = cfg.train.runner.loop
+    if teacher is not None:
+        return {own: partial(StudentRunner, teacher=teacher)}
+    one = own if cfg.train.policy.estimator.targets else asked
+    return {one: LOOPS[one]} if one else LOOPS
+
+
+def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
+    """Return the medians of rollout, update and iteration times [ms] and the range of the latter, over `count` iterations of
+    a training with new networks, after a first iteration that is left out.
+    """
+    shown: list[Progress] = []
+    display = SimpleNamespace(show=shown.append)
+    with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()) as said:
+        runner = kind(task, log_dir=Path(folder), device=str(task.device), display=display)
+        runner.learn(count + 1, init_at_random_ep_len=True)
+    seen = shown[1:]
+    whole = sorted(1e3 * (progress.collect_s + progress.learn_s) for progress in seen)
+    steps = task.cfg.train.runner.num_steps_per_env
+    return {
+        "rollout_ms": 1e3 * median([progress.collect_s for progress in seen]),
+        "update_ms": 1e3 * median([progress.learn_s for progress in seen]),
+        "iteration_ms": median(whole),
+        "iteration_ms_range": [whole[0], whole[-1]],
+        "steps_per_iteration": steps,
+        "robot_steps_per_s": task.num_envs * steps / median(whole) * 1e3,
+        "note": said.getvalue().strip(),
+    }
+
+
+def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
+    """Return the kernels of a control step as the graph replays them, slowest first; means over `steps` steps with small
+    random actions. `launches` is the number of launches in a control step, which varies with the iterations of solvers, and
+    `total_us` their GPU time [us].
+    """
+    actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
+    task.step(actions)
+    torch.cuda.synchronize()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for _ in range(steps):
+            task.step(actions)
+        torch.cuda.synchronize()
+    seen = [e for e in profile.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
+    times = [{"name": e.key, "launches": e.count / steps, "total_us": e.device_time_total / steps} for e in seen]
+    return sorted(times, key=lambda time: -time["total_us"])
+
+
+def kernel_table(times: list[dict[str, Any]], longest: int) -> str:
+    """Return the `longest` slowest kernels and the sum of all as lines of text."""
+    launches, total = (sum(time[key] for time in times) for key in ("launches", "total_us"))
+    whole = {"name": f"all {len(times)} kernels of a control step", "launches": launches, "total_us": total}
+    rows = [f"{time['total_us']:9.1f} {time['launches']:9.1f}  {time['name'][:90]}" for time in (*times[:longest], whole)]
+    return "\n".join([f"{'us':>9} {'launches':>9}  kernel", *rows])
+
+
+def report(task: BaseTask, result: dict[str, Any]) -> str:
+    """Return the results of a benchmark of a task as lines of text."""
+    where = device_name(torch.device(task.device))
+    how = "one CUDA graph, no host synchronisation in the timed steps" if task.captured else "eager"
+    lines = [
+        f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
+        f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)",
+        *([f"  moved by {result['policy']}"] if "policy" in result else []),
+        f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
+        *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
+        *([f"  mujoco-warp's own launches: {task.physics.why_library}"] if task.physics.why_library else []),
+        f"  steps of a robot that lost contacts because memory was too small: {result['overflows']:.0f}",
+        f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s",
+    ]
+    for loop, times in result.get("iterations", {}).items():
+        beyond = times["iteration_ms"] - times["steps_per_iteration"] * result["physics_ms"]
+        lines.append(
+            f"  {loop} training: rollout {times['rollout_ms']:.1f} + update {times['update_ms']:.1f} ms = iteration"
+            f" {times['iteration_ms']:.1f} ms, {beyond:.1f} ms beyond its physics ({times['robot_steps_per_s']:,.0f} robot"
+            " steps/s)" + (f"; {times['note']}" if times["note"] else "")
+        )
+    if "gpu_memory_gib" in result:
+        lines.append(f"  GPU memory in use: {result['gpu_memory_gib']:.1f} GiB")
+    return "\n".join(lines)
