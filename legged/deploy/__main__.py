@@ -22,7 +22,7 @@ from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import KINDS, SdkWire, UnitreeRobot
 from legged.errors import ConfigError, RunError, suggest
 from legged.process.command_parser import CommandParser
-from legged.process.paths import ready_to_write_file
+from legged.process.paths import ready_to_write
 
 BOUNDS = {"stand_seconds": (1.0, 60.0), "max_tilt": (0.1, 1.6), "max_age": (0.005, 0.5), "max_missed": (1, 50)}
 """Flag -> its smallest and largest value, in seconds, radians and cycles; degrees or milliseconds are refused."""
@@ -71,7 +71,13 @@ def _main(argv: list[str] | None) -> int:
     limits = limits_of(args)
     if not args.robot.startswith("udp:") and args.robot not in KINDS:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
-    ready_to_write_file("--log", args.log, endings=(".npz",))
+    try:
+        fits = args.log.suffix == ".npz" and not args.log.is_dir()
+    except OSError:  # such as a name that is too long
+        fits = False
+    if not fits:
+        raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
+    ready_to_write(args.log.parent)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
