@@ -71,17 +71,19 @@ def _main(argv: list[str] | None) -> int:
     limits = limits_of(args)
     if not args.robot.startswith("udp:") and args.robot not in KINDS:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
-    if args.log.suffix != ".npz":
-        raise ConfigError(f"--log: must end in .npz, got '{args.log}'")
-    if args.log.is_dir():
-        raise ConfigError(f"--log: {args.log} is a folder; expected a file")
+    try:
+        fits = args.log.suffix == ".npz" and not args.log.is_dir()
+    except OSError:  # such as a name that is too long
+        fits = False
+    if not fits:
+        raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
     ready_to_write(args.log.parent)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # refuse a policy that does not fit before the robot leaves its own controller
+    if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
-    hurries = take_priority()  # before a robot's SDK starts threads, which inherit the priority
+    hurries = take_priority()  # before a robot's SDK starts threads, which inherit it
     try:
         if args.robot in KINDS:
             robot: Interface = UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))

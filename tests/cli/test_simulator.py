@@ -129,7 +129,8 @@ def test_its_ground_and_its_time_step_are_its_own():
     simulated = SimulatedRobot(load_robot("anymal_c"), stairs(0.1), SimConfig(dt=0.001))
     assert simulated.model.opt.timestep == 0.001
     # Eight rings of steps lead up from the middle, 0.3 m wide and 0.1 m high.
-    ground = simulated._ground(np.array([[0.0, 0.0], [3.95, 0.0], [4.5, 0.0]]))
+    points = np.array([[0.0, 0.0], [3.95, 0.0], [4.5, 0.0]]) - simulated.data.qpos[:2]
+    ground = simulated.state({"heights": points}).sources["heights"] + simulated.data.qpos[2]
     np.testing.assert_allclose(ground, [-0.9, -0.1, 0.0], atol=0.11)
     assert ground[0] < ground[1] <= ground[2]
     assert simulated.data.qpos[2] == pytest.approx(ground[0] + simulated.robot.height, abs=1e-6)

@@ -214,7 +214,7 @@ def test_a_script_with_a_mistake_is_refused_by_its_line(tmp_path, text, says):
         (["--seconds", "nan"], 2, "error: --seconds: must be above 0, got nan"),
         (["--robot", "spot"], 2, "error: --robot: 'spot' is unknown"),
         (["--robot", "udp:here", "--commands", "walk.txt"], 2, "error: --robot: udp:here: expected udp:HOST:PORT"),
-        (["--log", "walk.txt"], 2, "error: --log: must end in .npz, got 'walk.txt'"),
+        (["--log", "walk.txt"], 2, "error: --log: must be the name of an .npz file, got 'walk.txt'"),
         (["--log", "walk.txt/log.npz"], 2, "error: walk.txt: cannot make the folder: walk.txt is a file"),
         (["--robot", "go2"], 2, "joint_names: 'go2' has no joint 'LF_HAA'"),
         (["--commands", "nothing.txt"], 2, "error: --commands: nothing.txt: cannot be read"),
