@@ -79,11 +79,11 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
     ready_to_write(args.log.parent)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # refuse a misfit before the robot leaves its own controller
+    if args.robot in KINDS:  # refuse a policy that does not fit before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
-    hurries = take_priority()  # before a robot's SDK starts threads, which inherit it
+    hurries = take_priority()  # before a robot's SDK starts threads, which inherit the priority
     try:
         if args.robot in KINDS:
             robot: Interface = UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
