@@ -1,5 +1,6 @@
 """A standard output that goes away ends nothing, and costs one line on standard error."""
 
+import contextlib
 import errno
 import io
 import subprocess
@@ -74,6 +75,16 @@ def test_a_process_without_standard_output_has_one_that_takes_everything(monkeyp
 
 def test_outside_of_a_command_nothing_is_watched():
     when_output_is_lost(lambda: pytest.fail("called"))
+
+
+def test_a_trial_that_writes_into_a_file_does_not_depend_on_the_terminal(monkeypatch):
+    """A sweep whose terminal is closed goes on: its trainings are not ended."""
+    monkeypatch.setattr(sys, "stdout", Failing(0, BrokenPipeError(errno.EPIPE, "Broken pipe")))
+    with forgiving_output() as output:
+        with contextlib.redirect_stdout(io.StringIO()):
+            when_output_is_lost(lambda: pytest.fail("called"))
+        print("lost", flush=True)
+        assert output.lost is not None
 
 
 def test_a_command_goes_on_to_its_end_and_then_says_so(monkeypatch, capsys):
