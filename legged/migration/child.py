@@ -6,6 +6,7 @@ in any case, are replaced by stand-ins: any use of a stand-in gives another one.
 
 import abc
 import ast
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -16,7 +17,6 @@ import os
 import re
 import sys
 import sysconfig
-import textwrap
 import traceback
 import types
 from collections.abc import Iterator
@@ -24,11 +24,11 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
-SECTIONS = {
+SECTIONS = (
     *("env", "terrain", "commands", "init_state", "control"),
     *("asset", "domain_rand", "rewards", "normalization", "noise"),
-}
-LEARNER_SECTIONS = {"policy", "algorithm", "runner"}
+)
+LEARNER_SECTIONS = ("policy", "algorithm", "runner")
 REPLACED = ("isaacgym", "rsl_rl")
 """Modules with a stand-in even if they are installed."""
 ALONE = "file_of_the_user"
@@ -37,15 +37,20 @@ BUILT_IN = "legged_gym's"
 """Name of the module of the classes in `KNOWN`."""
 GAP = 2
 """Largest number of folders without __init__.py between a file and its package."""
-DEEPEST, MOST, LONGEST = 12, 100_000, 10_000
-"""Largest depth and number of values, and length of a text."""
+LONGEST = 100_000
+"""Largest length of a value or of an error's text, in characters."""
 OPERATORS = ["add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul", "and", "or", "xor", "lshift", "rshift"]
 INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
+READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
+"""Name -> pattern of the text of a method."""
+CUT = "(cut)"
+"""Name of some columns of joined parts."""
 CALLS: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 """Calls of stand-ins: name, and arguments."""
 KNOWN: dict[str, Any] = {}
 """Objects of legged_gym that its stand-in has, by name."""
-USED: dict[str, list[str]] = {"stand_ins": [], "built_in": []}
+USED: dict[str, None] = {}
+"""Names of the classes in `KNOWN` that the user's files import."""
 
 
 class StandIn:
@@ -53,15 +58,12 @@ class StandIn:
     computed from, and the parts that `torch.cat` joined.
     """
 
-    parts: "list[StandIn] | None"
-
     def __init__(self, *names: str, parts: "list[StandIn] | None" = None) -> None:
-        self.names, self.parts = tuple(dict.fromkeys(names)), parts
+        self.names = tuple(dict.fromkeys(names))
+        self.parts = parts
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return StandIn(f"{self.names[0]}.{name}", *self.names[1:])
+        return _attribute(self.names[0], name, *self.names[1:])
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         name = self.names[0].rpartition(".")[2]
@@ -73,10 +75,9 @@ class StandIn:
         return _computed(self, *args)
 
     def __getitem__(self, key: Any) -> Any:
-        keys = [
-            f"{k.start or ''}:{k.stop or ''}" if isinstance(k, slice) else k for k in (key if type(key) is tuple else [key])
-        ]
-        return StandIn(CUT if self.parts else f"{self.names[0]}[{', '.join(map(str, keys))}]", *self.names[1:])
+        keys = key if type(key) is tuple else (key,)
+        text = ", ".join(f"{k.start or ''}:{k.stop or ''}" if isinstance(k, slice) else str(k) for k in keys)
+        return StandIn(CUT if self.parts else f"{self.names[0]}[{text}]", *self.names[1:])
 
     def __mro_entries__(self, bases: Any) -> tuple[type, ...]:
         return (Base,)
@@ -92,8 +93,10 @@ class StandIn:
     def __setitem__(self, key: Any, value: Any) -> None: ...
 
 
-CUT = "(cut)"
-"""Name of some columns of joined parts."""
+def _attribute(owner: str, name: str, *others: str) -> StandIn:
+    if name.startswith("__"):
+        raise AttributeError(name)
+    return StandIn(f"{owner}.{name}", *others)
 
 
 def _computed(*values: Any) -> StandIn:
@@ -107,9 +110,7 @@ for _name in (*OPERATORS, *(f"r{operator}" for operator in OPERATORS), "neg", "p
 
 class _Meta(abc.ABCMeta):
     def __getattr__(cls, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return StandIn(f"{cls.__name__}.{name}")
+        return _attribute(cls.__name__, name)
 
 
 class Base(metaclass=_Meta):
@@ -123,12 +124,11 @@ class StandInModule(types.ModuleType):
     """Module in place of one that is not installed."""
 
     def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        if name in KNOWN:
-            USED["built_in"] += [name] if name not in USED["built_in"] and isinstance(KNOWN[name], type) else []
-            return KNOWN[name]
-        return StandIn(f"{self.__name__}.{name}")
+        if name not in KNOWN:
+            return _attribute(self.__name__, name)
+        if isinstance(KNOWN[name], type):
+            USED[name] = None
+        return KNOWN[name]
 
 
 class Finder:
@@ -152,11 +152,9 @@ class Finder:
         return StandInModule(spec.name)
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Note the stand-in, and give it the names that Isaac Gym's star import has."""
-        USED["stand_ins"].append(module.__name__)
+        """Give the stand-in the names that Isaac Gym's star import has."""
         if module.__name__ == "isaacgym.torch_utils":
-            for name, alias in (("numpy", "np"), ("torch", "torch"), ("os", "os")):
-                setattr(module, alias, importlib.import_module(name))
+            exec("import os, torch, numpy as np", vars(module))
 
 
 def _is_installed(file: str) -> bool:
@@ -180,53 +178,66 @@ def define(name: str, data: dict[str, Any], parent: Any) -> type:
 
 def load(file: Path) -> tuple[types.ModuleType, Path]:
     """Import the file as a module of its package; return it and the folder of the package or, without one, of the file."""
-    gap, top = 0, None
+    gap, root, own = 0, file.parent, ALONE
     for folder in file.parents:
-        top, gap = (folder, 0) if (folder / "__init__.py").is_file() else (top, gap + 1)
+        gap += 1
+        if (folder / "__init__.py").is_file():
+            gap, root, own = 0, folder, folder.name
         if gap > GAP:
             break
-    root = file.parent if top is None else top
-    sys.path.insert(0, str(root if top is None else root.parent))
-    own = ALONE if top is None else root.name
+    sys.path.insert(0, str(root if own == ALONE else root.parent))
     sys.meta_path.insert(0, Finder(only=REPLACED, own=own))  # type: ignore[arg-type]
     sys.meta_path.append(Finder(own=own))  # type: ignore[arg-type]
-    if top is None:
-        package = types.ModuleType(ALONE)
-        package.__path__ = [str(root)]
-        sys.modules[ALONE] = package
-    return importlib.import_module(module_name(file, root, top is None)), root
+    if own == ALONE:
+        sys.modules[ALONE] = types.ModuleType(ALONE)
+        sys.modules[ALONE].__path__ = [str(root)]
+    return importlib.import_module(module_name(file, root)), root
 
 
-def module_name(file: Path, root: Path, alone: bool) -> str:
+def module_name(file: Path, root: Path) -> str:
     """Return the dotted name of a file below the folder `root`."""
-    parts = (ALONE, file.stem) if alone else file.relative_to(root.parent).with_suffix("").parts
-    return ".".join(parts).removesuffix(".__init__")
+    package = ALONE if ALONE in sys.modules else root.name
+    return ".".join((package, *file.relative_to(root).with_suffix("").parts)).removesuffix(".__init__")
+
+
+def objects() -> list[Any]:
+    """Return the objects of the fork's modules and of legged_gym's stand-in."""
+    modules = [KNOWN, *(vars(module) for name, module in list(sys.modules.items()) if _is_of_fork(name))]
+    return [value for module in modules for value in list(module.values())]
+
+
+def fork_classes(attribute: str) -> list[type]:
+    """Return the user's classes with an attribute that begins so, without base classes of others."""
+    classes = dict.fromkeys(value for value in objects() if isinstance(value, type) and _is_of_fork(value.__module__))
+    having = [cls for cls in classes if any(name.startswith(attribute) for name in dir(cls))]
+    return [cls for cls in having if not any(other is not cls and issubclass(other, cls) for other in having)]
 
 
 def registered() -> dict[str, tuple[Any, Any, Any]]:
     """Return task -> class, configuration and learner's configuration, from all registries that were filled."""
     found: dict[str, tuple[Any, Any, Any]] = {}
-    for module in [KNOWN, *(vars(module) for name, module in list(sys.modules.items()) if _is_of_fork(name))]:
-        for value in list(module.values()):
-            tables = [getattr(value, name, None) for name in ("task_classes", "env_cfgs", "train_cfgs")]
-            if all(isinstance(table, dict) for table in tables):
-                found |= {task: (tables[0].get(task), cfg, tables[2].get(task)) for task, cfg in tables[1].items()}  # type: ignore
+    for value in objects():
+        tables = [getattr(value, name, None) for name in ("task_classes", "env_cfgs", "train_cfgs")]
+        if all(isinstance(table, dict) for table in tables):
+            found |= {task: (tables[0].get(task), cfg, tables[2].get(task)) for task, cfg in tables[1].items()}  # type: ignore
     return found
 
 
-def _has(owner: Any, names: set[str]) -> bool:
-    return any(isinstance(getattr(owner, name, None), type) for name in names)
+def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str, type]:
+    """Return the classes of a module that have a section of one of these names."""
+    return {
+        key: value
+        for key, value in vars(module).items()
+        if isinstance(value, type) and any(isinstance(getattr(value, name, None), type) for name in names)
+    }
 
 
 def configurations(module: types.ModuleType) -> dict[str, type]:
     """Return the environment configurations that a module defines. A function `config_*` makes one of a class that its module
     imports.
     """
-    classes = {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type) and _has(value, SECTIONS) and not _has(value, LEARNER_SECTIONS)
-    }
+    learners = with_sections(module, LEARNER_SECTIONS)
+    classes = {name: value for name, value in with_sections(module, SECTIONS).items() if name not in learners}
     own = {name: value for name, value in classes.items() if value.__module__ == module.__name__}
     if not own and len(classes) == 1:
         for name, value in list(vars(module).items()):
@@ -239,11 +250,7 @@ def configurations(module: types.ModuleType) -> dict[str, type]:
 
 def learner_of(module: types.ModuleType, name: str) -> Any:
     """Return the learner's configuration that belongs to an environment's by its name, or the only one."""
-    learners = {
-        key: value
-        for key, value in vars(module).items()
-        if isinstance(value, type) and value.__module__ == module.__name__ and _has(value, LEARNER_SECTIONS)
-    }
+    learners = {k: v for k, v in with_sections(module, LEARNER_SECTIONS).items() if v.__module__ == module.__name__}
     for other in (f"{name}PPO", name.replace("Cfg", "CfgPPO"), name.replace("Config", "ConfigPPO")):
         if other in learners:
             return learners[other]
@@ -251,24 +258,21 @@ def learner_of(module: types.ModuleType, name: str) -> Any:
 
 
 @functools.cache
-def lines_of(file: str) -> dict[str, int]:
-    """Return dotted name of a class or of its attribute -> line in a file."""
-    found: dict[str, int] = {}
+def nodes_of(file: str) -> dict[str, Any]:
+    """Return dotted name of a class, of its method or of its attribute -> node of a file's syntax tree."""
+    found: dict[str, Any] = {}
 
     def visit(node: ast.AST, prefix: str) -> None:
         for child in ast.iter_child_nodes(node):
-            if isinstance(child, ast.ClassDef):
-                found[f"{prefix}{child.name}"] = child.lineno
-                visit(child, f"{prefix}{child.name}.")
+            if isinstance(child, ast.ClassDef | ast.FunctionDef):
+                found[f"{prefix}{child.name}"] = child
             elif isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):
-                found[f"{prefix}{child.id}"] = child.lineno
-            elif not isinstance(child, ast.FunctionDef):
-                visit(child, prefix)
+                found[f"{prefix}{child.id}"] = child
+            if not isinstance(child, ast.FunctionDef):
+                visit(child, f"{prefix}{child.name}." if isinstance(child, ast.ClassDef) else prefix)
 
-    try:
+    with contextlib.suppress(OSError, SyntaxError, ValueError, RecursionError):
         visit(ast.parse(Path(file).read_bytes()), "")
-    except (OSError, SyntaxError, ValueError, RecursionError):
-        return {}
     return found
 
 
@@ -277,87 +281,73 @@ def place_of(owner: type, name: str) -> tuple[str, int]:
     file = getattr(sys.modules.get(owner.__module__), "__file__", None)
     if file is None:
         return f"legged_gym's {owner.__qualname__}", 0
-    lines = lines_of(file)
-    return file, lines.get(f"{owner.__qualname__}.{name}", lines.get(owner.__qualname__, 0))
+    nodes, cls = nodes_of(file), owner.__qualname__
+    return file, getattr(nodes.get(f"{cls}.{name}", nodes.get(cls)), "lineno", 0)
 
 
 class NotPlain(Exception):
     """A value that is not made of numbers, texts, lists and tables."""
 
 
-def plain(value: Any, depth: int = 0) -> Any:
-    """Return a value for JSON.
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it.
 
     Raises:
         NotPlain: it has no such form; the text says why.
     """
-    if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value.bit_length() < 1000):
-        return value
-    if isinstance(value, str) and len(value) <= LONGEST:
-        return value
-    if isinstance(value, StandIn | StandInModule):
-        raise NotPlain(f"comes from {getattr(value, 'names', ['a module'])[0]}, which is not installed")
-    if depth > DEEPEST or (isinstance(value, str | list | tuple | dict) and len(value) > LONGEST):
+
+    def other(item: Any) -> Any:
+        if isinstance(item, StandIn | StandInModule):
+            raise NotPlain(f"comes from {getattr(item, 'names', ['a module'])[0]}, which is not installed")
+        if hasattr(item, "tolist"):
+            return item.tolist()
+        raise NotPlain(f"is of type {type(item).__name__}")
+
+    try:
+        text = json.dumps(value, default=other)
+    except TypeError as error:
+        raise NotPlain(f"has {error}") from None
+    except (ValueError, RecursionError):
+        text = " " * (LONGEST + 1)
+    if len(text) > LONGEST:
         raise NotPlain("is too large")
-    if isinstance(value, list | tuple):
-        return [plain(item, depth + 1) for item in value]
-    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return {key: plain(item, depth + 1) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist(), depth + 1)
-    raise NotPlain(f"is of type {type(value).__name__}")
+    return json.loads(text)
 
 
-def settings(owner: Any, prefix: str, found: dict[str, Any], above: tuple[int, ...] = ()) -> None:
-    """Add the settings of a configuration, a class or an instance, and of its sections: dotted path -> value, place, reason
-    why the value is unknown.
+def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:
+    """Return the settings of a configuration, a class or an instance, and of its sections: dotted path -> value, file, line,
+    reason why the value is unknown.
     """
+    found: dict[str, Any] = {}
     cls = owner if isinstance(owner, type) else type(owner)
-    owners = {name: part for part in reversed(cls.__mro__[:-1]) for name in vars(part) if not name.startswith("_")}
-    names = [*owners, *(name for name in getattr(owner, "__dict__", {}) if name not in owners and not name.startswith("_"))]
-    for name in names:
+    owners = {name: part for part in reversed(cls.__mro__[:-1]) for name in vars(part)}
+    for name in owners | getattr(owner, "__dict__", {}):
         value = getattr(owner, name, None)
         kind = value if isinstance(value, type) else type(value)
-        if inspect.isroutine(value) or len(found) > MOST:
+        if name.startswith("_") or inspect.isroutine(value):
             continue
         if hasattr(kind, "__mro__") and _is_of_fork(kind.__module__) and not isinstance(value, StandIn):
-            if id(kind) not in above and len(above) < DEEPEST:
-                settings(value, f"{prefix}{name}.", found, (*above, id(kind)))
+            found |= settings(value, f"{prefix}{name}.", (*above, kind)) if kind not in above else {}
             continue
         place = place_of(owners.get(name, cls), name)
         try:
             found[f"{prefix}{name}"] = [plain(value), *place, ""]
         except NotPlain as why:
             found[f"{prefix}{name}"] = [None, *place, str(why)]
-
-
-def canonical(node: Any) -> str:
-    """Return a text of a syntax tree that does not depend on the layout or on the version of Python. Rewards in a container
-    class read `self.env` in place of `self`.
-    """
-    if isinstance(node, ast.Attribute) and node.attr == "env" and isinstance(node.value, ast.Name):
-        node = node.value
-    if isinstance(node, ast.AST):
-        fields = [
-            (k, v) for k, v in ast.iter_fields(node) if k not in ("ctx", "kind", "type_comment") and v not in (None, [])
-        ]
-        return f"{type(node).__name__}({','.join(f'{k}={canonical(v)}' for k, v in fields)})"
-    return f"[{','.join(map(canonical, node))}]" if isinstance(node, list) else repr(node)
+    return found
 
 
 def method(function: Any) -> dict[str, Any]:
-    """Return place and digest of a method, and what matters of its text. The docstring does not count."""
-    lines, first = inspect.getsourcelines(function)
-    text = textwrap.dedent("".join(lines))
-    node = ast.parse(text).body[0]
-    assert isinstance(node, ast.FunctionDef)
-    body = node.body[1:] if ast.get_docstring(node) is not None else node.body
-    digest = hashlib.sha256(canonical(body).encode()).hexdigest()[:10]
-    reads = [name for name, pattern in READS.items() if re.search(pattern, ast.unparse(body))]  # type: ignore[arg-type]
-    return {"place": [inspect.getsourcefile(function), first], "digest": digest, "reads": reads}
-
-
-READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
+    """Return place and digest of a method, and what matters of its text. Its layout and docstring do not count. Rewards in a
+    container class read `self.env` in place of `self`.
+    """
+    code = inspect.unwrap(function).__code__
+    node = nodes_of(code.co_filename).get(code.co_qualname, ast.parse(""))
+    body = node.body if ast.get_docstring(node) is None else node.body[1:]
+    text = re.sub(r"\b(\w+)\.env\b", r"\1", "\n".join(map(ast.unparse, body)))
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    reads = [name for name, pattern in READS.items() if re.search(pattern, text)]
+    return {"place": [code.co_filename, code.co_firstlineno], "digest": digest, "reads": reads}
 
 
 def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str, Any]]]:
@@ -367,33 +357,16 @@ def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str
         for name in dir(cls):
             function = inspect.getattr_static(cls, name)
             if inspect.isfunction(function) and (name.startswith("_reward_") or name in names):
-                try:
-                    found.setdefault(name, []).append(method(function))
-                except (OSError, SyntaxError, TypeError, AssertionError, RecursionError):
-                    place = [function.__code__.co_filename, function.__code__.co_firstlineno]
-                    found.setdefault(name, []).append({"place": place, "digest": "", "reads": []})
+                found.setdefault(name, []).append(method(function))
     return found
-
-
-def fork_classes(attribute: str) -> list[type]:
-    """Return the user's classes with an attribute that begins so, without base classes of others."""
-    modules = [vars(module) for name, module in list(sys.modules.items()) if _is_of_fork(name)]
-    classes = {
-        value
-        for module in modules
-        for value in list(module.values())
-        if isinstance(value, type) and _is_of_fork(value.__module__) and any(n.startswith(attribute) for n in dir(value))
-    }
-    return [cls for cls in classes if not any(other is not cls and issubclass(other, cls) for other in classes)]
 
 
 def environment_classes(task_class: Any, root: Path) -> list[type]:
     """Return the class of the task; if no registry names it, all classes with rewards in the package or next to the file."""
     if isinstance(task_class, type):
         return [task_class]
-    alone = ALONE in sys.modules
-    for file in sorted(root.glob("*.py") if alone else root.rglob("*.py"))[:1000]:
-        name = module_name(file, root, alone)
+    for file in sorted(root.glob("*.py" if ALONE in sys.modules else "**/*.py"))[:1000]:
+        name = module_name(file, root)
         if b"def _reward_" in file.read_bytes() and name not in sys.modules:
             try:
                 importlib.import_module(name)
@@ -411,7 +384,8 @@ def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> Non
 
 def terrains(config: Any) -> list[Any] | None:
     """Return, for each entry of terrain_proportions and for each half of its columns, the terrain functions that the fork's
-    make_terrain calls and the sign of their slope or step; None without such a method.
+    make_terrain calls, joined by " + ", and the sign of the first one's slope or height of steps; None for a half that fails,
+    and without such a method.
     """
     shares, makers = getattr(config, "terrain_proportions", None), fork_classes("make_terrain")
     if not makers or not isinstance(shares, list | tuple):
@@ -427,9 +401,11 @@ def terrains(config: Any) -> list[Any] | None:
             values = {"self": self, "choice": end - share * (1 - part), "difficulty": 0.5, "proportions": ends, "cfg": config}
             try:
                 replay(make, values, parts)
-                found[-1].append([[name, sign(args, options)] for name, args, options in CALLS if name.endswith("_terrain")])
             except Exception:
                 found[-1].append(None)
+                continue
+            calls = [call for call in CALLS if call[0].endswith("_terrain")]
+            found[-1].append([" + ".join(name for name, *_ in calls), sign(*calls[0][1:]) if calls else 0])
     return found
 
 
@@ -456,57 +432,50 @@ def observations(cls: type, config: Any) -> list[Any]:
 def answer(request: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to a request: file, task, and legged_gym's defaults."""
     registry = types.SimpleNamespace(task_classes={}, env_cfgs={}, train_cfgs={})
-    tables = vars(registry).values()
-    KNOWN.update(register=lambda name, *entries: [table.update({name: e}) for table, e in zip(tables, entries, strict=False)])
-    KNOWN.update(task_registry=registry, LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
-    registry.register = KNOWN["register"]
+    tables = list(vars(registry).values())
+    registry.register = lambda name, *entries: [t.update({name: entry}) for t, entry in zip(tables, entries, strict=False)]
+    KNOWN.update(task_registry=registry, register=registry.register, LEGGED_GYM_ROOT_DIR="{LEGGED_GYM_ROOT_DIR}")
     for name, (parent, data) in request["known"].items():
         KNOWN[name] = define(name, data, KNOWN.get(parent))
     module, root = load(Path(request["file"]))
     asked, own, tasks = request["task"], configurations(module), registered()
     of_file = [task for task, entry in tasks.items() if not own or type(entry[1]) in own.values()]
-    result: dict[str, Any] = {"classes": list(own), "tasks": of_file, **USED}
-    task_class = None
     if asked in tasks:
         name, (task_class, environment, learner) = asked, tasks[asked]
     elif asked in own or len(own) == 1:
-        name = asked if asked in own else next(iter(own))
-        environment, known = own[name], [task for task, entry in tasks.items() if type(entry[1]) is own[name]]
-        learner = learner_of(module, name)
-        if known:
-            task_class, _, learner = tasks[known[0]]
-        result["given"] = asked if asked not in own else None
-        name = known[0] if known else name
+        chosen = asked if asked in own else next(iter(own))
+        environment = own[chosen]
+        name = next((task for task, entry in tasks.items() if type(entry[1]) is environment), "")
+        task_class, _, learner = tasks.get(name, (None, None, learner_of(module, chosen)))
+        name = asked if asked not in (None, *own) else name or snake(chosen)
     else:
-        return result
-    found: dict[str, Any] = {}
-    settings(environment, "", found)
-    theirs: dict[str, Any] = {}
-    settings(learner, "", theirs) if learner is not None else None
-    names = [cls.__name__ if isinstance(cls, type) else type(cls).__name__ for cls in (environment, learner)]
+        return {"classes": list(own), "tasks": of_file}
     classes = environment_classes(task_class, root)
-    return result | {
+    return {
         "task": name,
-        "environment": names[0],
-        "learner": None if learner is None else names[1],
-        "settings": found,
-        "learning": theirs,
+        "names": [getattr(cls, "__name__", type(cls).__name__) for cls in (environment, learner) if cls is not None],
+        "built_in": list(USED),
+        "settings": settings(environment) | ({} if learner is None else settings(learner)),
         "methods": methods_of(classes, request["methods"]),
         "observations": observations(classes[0], environment) if len(classes) == 1 else [None, None],
         "terrains": terrains(getattr(environment, "terrain", None)),
     }
 
 
+def snake(name: str) -> str:
+    """Return a task name for a class: 'GO2RoughCfg' -> 'go2_rough'."""
+    name = re.sub(r"(Cfg|Config)$", "", name) or name
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name).lower().strip("_") or "task"
+
+
 def failure(error: BaseException) -> dict[str, Any]:
     """Return the answer for code that raised an error: its text, and the last place in the user's files."""
-    frames = [
-        f for f in traceback.extract_tb(error.__traceback__) if f.filename != __file__ and not _is_installed(f.filename)
-    ]
-    file, line = (frames[-1].filename, frames[-1].lineno) if frames else ("", 0)
+    places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    own = [(file, line) for file, line in places if file != __file__ and not _is_installed(file)]
     if isinstance(error, SyntaxError) and error.filename:
-        file, line = error.filename, error.lineno
+        own.append((error.filename, error.lineno))
     text = f"{type(error).__name__}: {error}"[:LONGEST].replace(f"{ALONE}.", "")
-    return {"error": text, "place": [file, line]}
+    return {"error": text, "place": own[-1] if own else ("", 0)}
 
 
 def main() -> None:

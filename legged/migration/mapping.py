@@ -1,17 +1,17 @@
 """Mapping of a fork's live configuration and methods to a task."""
 
 import re
-from collections.abc import Iterable
 from typing import Any
 
 from legged.config.checks import build
+from legged.config.dotted import value_at
 from legged.config.origins import Origins
 from legged.config.schema import STATE_TERMS, TerrainConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.migration import tables
-from legged.migration.legged_gym_defaults import DIGESTS
-from legged.migration.reading import Fork, Found, Method
+from legged.migration.reading import DEFAULTS as OF_LEGGED_GYM
+from legged.migration.reading import DIGESTS, Fork, Found
 from legged.migration.translation import DEFAULTS, Translation, is_number
 from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
@@ -37,7 +37,7 @@ def map_settings(fork: Fork) -> Translation:
     _contacts(result)
     _rewards(result, fork)
     _observations(result, fork)
-    _learning(result)
+    _recurrent(result)
     _random_model(result)
     _delay(result)
     _hooks(result, fork)
@@ -55,9 +55,8 @@ def _moved(settings: dict[str, Found]) -> dict[str, Found]:
 
 
 def _terrain(result: Translation, fork: Fork) -> None:
-    mesh = result.get("terrain.mesh_type", "plane")
-    shares = result.get("terrain.terrain_proportions")
-    result.done |= set(tables.OF_TERRAIN) | set(tables.OF_HEIGHTS)
+    mesh, path = result.get("terrain.mesh_type", "plane"), "terrain.terrain_proportions"
+    result.done |= {path, *tables.OF_TERRAIN, *tables.OF_HEIGHTS}
     if result.get("terrain.measure_heights", False):
         result.take(tables.OF_HEIGHTS)
     if mesh in ("plane", "none", None):
@@ -67,62 +66,52 @@ def _terrain(result: Translation, fork: Fork) -> None:
         return
     result.put("terrain.mesh_type", "height_map", "terrain.mesh_type")
     result.take(tables.OF_TERRAIN)
-    rows = int(result.number("terrain.num_rows", 10))
-    if result.number("terrain.max_init_terrain_level", 5) >= rows > 0:
+    rows = int(result.get("terrain.num_rows", 10.0))
+    if result.get("terrain.max_init_terrain_level", 5.0) >= rows > 0:
         result.put("terrain.max_init_terrain_level", rows - 1, "terrain.max_init_terrain_level", "of the rows there are")
-    unknown: list[str] = []
-    if isinstance(shares, dict):
-        found = result.table("terrain.terrain_proportions")
-    else:
-        found = _shares(result.numbers("terrain.terrain_proportions", []), fork.terrains, unknown)
-    kept = {name: share for name, share in found.items() if share > 0.0 and name in TERRAIN_TYPES}
-    unknown += [name for name, share in found.items() if share > 0.0 and name not in kept]
-    _fitting(result, kept, unknown)
+    named = path in result.theirs and isinstance(result.theirs[path].value, dict)
+    _fits(result, "flat")
+    shares = result.get(path, {}) if named else _shares(result.get(path, []), fork.terrains)
+    shares = {name: share for name, share in shares.items() if share > 0.0}
+    kept = {name: share for name, share in shares.items() if name in TERRAIN_TYPES and _fits(result, name)}
+    unknown = [name for name in shares if name not in kept]
     if unknown:
-        result.lose(
-            "terrain.terrain_proportions", f"not here or too large: {', '.join(unknown)}; types here are in terrain.md"
-        )
+        result.lose(path, f"not here or too large: {', '.join(unknown)}; types here are in terrain.md")
     comment = "none of the file's types is here" if not kept else f"theirs has {', '.join(unknown)} too" if unknown else ""
     kept = kept or {"flat": 1.0}
     total = sum(kept.values())
     kept, joined = _of_whole_columns({name: share / total for name, share in kept.items()}, result)
     comment = comment or (f"{', '.join(joined)} would have less than one column" if joined else "")
-    result.put("terrain.proportions", kept, "terrain.terrain_proportions", comment)
+    result.put("terrain.proportions", kept, path, comment)
 
 
-def _shares(proportions: list[float], functions: list[Any] | None, unknown: list[str]) -> dict[str, float]:
+def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, float]:
     """Return terrain type -> share of a list, by the functions that the fork calls, or by legged_gym's order."""
     shares: dict[str, float] = {}
+    kinds = tables.TERRAINS if functions is None else functions
     for i, share in enumerate(proportions):
-        if functions is None:
-            parts = tables.TERRAINS[i] if i < len(tables.TERRAINS) else {f"entry {i + 1}": 1.0}
-        else:
-            parts = {}
-            for calls in functions[i]:
-                names = tuple(name for name, _ in calls or [[f"entry {i + 1}", 0]]) if calls != [] else ()
-                kinds = tables.TERRAIN_FUNCTIONS.get(names)
-                kind = kinds[(calls[0][1] if calls else 0) + 1] if kinds else ""
-                parts[kind or " + ".join(names)] = parts.get(kind or " + ".join(names), 0.0) + 0.5
-        for name, part in parts.items() if share > 0.0 else ():
-            shares[name] = shares.get(name, 0.0) + float(share) * part
+        parts = kinds[i] if i < len(kinds) else [None]
+        for part in parts:
+            name = part
+            if isinstance(part, list):
+                name = tables.TERRAIN_FUNCTIONS.get(part[0], [""] * 3)[part[1] + 1] or part[0]
+            name = name or f"entry {i + 1}"
+            shares[name] = shares.get(name, 0.0) + share / len(parts)
     return shares
 
 
-def _fitting(result: Translation, shares: dict[str, float], unknown: list[str]) -> None:
-    """Remove the types that do not fit on the file's tiles; if not even level ground fits, take the default sizes."""
-    for name in ["flat", *shares]:
-        sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
-        try:
-            check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
-        except ConfigError as error:
-            if name == "flat":
-                reason = str(error).partition("terrain.")[2]
-                for path in tables.OF_TERRAIN:
-                    if result.settings.pop(path, None) is not None:
-                        result.lose(path, f"the terrain would be refused: {reason}")
-            else:
-                shares.pop(name)
-                unknown.append(name)
+def _fits(result: Translation, name: str) -> bool:
+    """Return True if a type fits on the file's tiles; if not even level ground fits, take the default sizes."""
+    sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
+    try:
+        check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
+    except ConfigError as error:
+        if name != "flat":
+            return False
+        for path in tables.OF_TERRAIN:
+            if result.settings.pop(path, None) is not None:
+                result.lose(path, f"the terrain would be refused: {str(error).partition('terrain.')[2]}")
+    return True
 
 
 def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[dict[str, float], list[str]]:
@@ -142,8 +131,8 @@ def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[di
 
 def _commands(result: Translation) -> None:
     """Map the command curriculum: legged_gym widens vx by 0.5 m/s up to max_curriculum."""
-    limit = result.number("commands.max_curriculum", 0.0)
-    speeds = result.numbers("commands.ranges.lin_vel_x", [])
+    limit = result.get("commands.max_curriculum", 0.0)
+    speeds = result.get("commands.ranges.lin_vel_x", [])
     if result.get("commands.curriculum", False) is not True or len(speeds) != 2:
         return
     low, high = speeds
@@ -159,15 +148,15 @@ def _commands(result: Translation) -> None:
 
 def _contacts(result: Translation) -> None:
     """Average the robot's friction with the ground's, as PhysX does; MuJoCo takes the robot's. Map the filter of contacts."""
-    own = result.numbers("domain_rand.friction_range", [])
-    ground = result.number("terrain.static_friction", 1.0)
+    own = result.get("domain_rand.friction_range", [])
+    ground = result.get("terrain.static_friction", 1.0)
     if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
         mean = [round(0.5 * (value + ground), 4) for value in own]
         comment = f"PhysX averages the robot's {own[0]:g} to {own[1]:g} with the ground's {ground:g}"
         result.put("domain_rand.friction_range", mean, "domain_rand.friction_range", comment)
     path = "asset.self_collisions"
-    if result.number(path, 1) == 0 and path in result.theirs:
-        if result.theirs[path].place.file.startswith("legged_gym's"):
+    if path in result.theirs and result.get(path, 1.0) == 0:
+        if result.theirs[path].place.startswith("legged_gym's"):
             result.lose(path, "legged_gym lets a robot touch itself unless told otherwise; sim.self_collisions=true does")
         else:
             result.put("sim.self_collisions", True, path, "theirs is a filter, 0 lets through")
@@ -175,42 +164,34 @@ def _contacts(result: Translation) -> None:
 
 def _rewards(result: Translation, fork: Fork) -> None:
     """Map the scales of rewards with legged_gym's formula; name the methods of the others, which have no scale here."""
-    known, defaults = LeggedRobot.terms("_reward_"), DEFAULTS["rewards"]["scales"]
-    prefix, mapped = "rewards.scales.", set()
-    sigma: list[Method] = []
-    paste, named = [], 0
+    known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
+    sigma, mapped, paste = "", set(), []
     for path in [path for path in result.theirs if path.startswith(prefix)]:
         name, found = path.removeprefix(prefix), result.theirs[path]
-        scale = result.get(path)
-        if found.why_unknown or not scale:
-            continue
-        if not is_number(scale):
-            result.lose(path, "expected a number")
+        scale = result.get(path, 0.0)
+        if not scale:
             continue
         methods = fork.methods.get(f"_reward_{name}", [])
         own = next((method for method in methods if not method.original), None)
         # In legged_gym the scale feet_stumble has no method, so it has no effect.
         ours = "stumble" if name == "feet_stumble" and not fork.methods else name
-        named += 1
-        missing = bool(fork.methods) and not methods
-        if own is not None or missing or f"_reward_{ours}" not in DIGESTS or ours not in known:
-            then = f"rewards.scales.{name}: {scale:g}"
-            if missing:
-                paste.append(f"nothing for {then} ({found.place}): the fork's classes have no _reward_{name}")
-            else:
-                paste.append(f"_reward_{name} ({own.place if own else found.place}), then set {then}")
-            sigma += [own] if own is not None and SIGMA in own.reads else []
+        then = f"rewards.scales.{name}: {scale:g}"
+        if fork.methods and not methods:
+            paste.append(f"nothing for {then} ({found.place}): the fork's classes have no _reward_{name}")
+        elif own is not None or f"_reward_{ours}" not in DIGESTS or ours not in known:
+            paste.append(f"_reward_{name} ({own.place if own else found.place}), then set {then}")
+            sigma = sigma or (own.place if own is not None and SIGMA in own.reads else "")
         else:
             mapped.add(ours)
             result.put(f"{prefix}{ours}", float(scale), path)
-    for name in set(defaults) - mapped:
+    for name in [name for name in DEFAULTS["rewards"]["scales"] if name not in mapped]:
         result.put(f"{prefix}{name}", 0.0, "")
     path = f"rewards.{SIGMA}"
     if sigma and path in result.theirs:
-        result.lose(path, f"divides the squared error here; {sigma[0].place} has another formula: set it with that method")
+        result.lose(path, f"divides the squared error here; {sigma} has another formula: set it with that method")
     else:
         result.take({path: path})
-    counted = f"{len(mapped)} of {named} scales are mapped, with legged_gym's formulas"
+    counted = f"{len(mapped)} of {len(mapped) + len(paste)} scales are mapped, with legged_gym's formulas"
     if not fork.methods:
         counted += "; no class with rewards was found near the file, so formulas of the same names are not compared"
     result.note("rewards", counted + (f"; {len(paste)} wait for the fork's own methods" if paste else ""))
@@ -219,34 +200,27 @@ def _rewards(result: Translation, fork: Fork) -> None:
 
 def _observations(result: Translation, fork: Fork) -> None:
     """Map the observations: by what compute_observations joins or, without a class, by their number."""
-    where = next(iter(fork.methods.get("compute_observations", [])), None)
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
-    history = next((result.get(f"env.{name}") for name in tables.HISTORY if f"env.{name}" in result.theirs), None)
-    one = next((result.get(f"env.{name}") for name in tables.ONE_STEP if f"env.{name}" in result.theirs), None)
+    history, one = (result.get(result.has(*names) or names[0]) for names in (tables.HISTORY, tables.ONE_STEP))
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
         history = numbers[0] // one
-    parts = fork.observations
-    if where is None:
-        joints, points = int(result.number("env.num_actions", 12)), 0
-        if result.get("terrain.measure_heights", False):
-            points = len(result.numbers("terrain.measured_points_x", [])) * len(
-                result.numbers("terrain.measured_points_y", [])
-            )
-        guesses = [_by_number(number, joints, points) for number in numbers]
-        if guesses[0] is None:
-            result.note("observations", f"{numbers[0]} numbers are not those of legged_gym: the groups here are the defaults")
-        else:
-            result.note("observations", "guessed from the number alone, since there is no class near the file")
-        groups = [None if guess is None else guess[0] for guess in guesses]
-        history = history or (guesses[0] or ([], 1))[1]
-    elif parts[0] is None:
-        result.note("observations", f"{where.place} joins them in its own way: the groups here are the defaults")
-        groups = [None, None]
+    groups: list[list[str] | None] = [None, None]
+    if "compute_observations" not in fork.methods:
+        (groups[0], steps), (groups[1], _) = (_by_number(result, number) for number in numbers)
+        history = history or steps
+        text = "guessed from the number alone, since there is no class near the file"
+        if groups[0] is None:
+            text = f"{numbers[0]} numbers are not those of legged_gym: the groups here are the defaults"
+    elif fork.observations[0] is None:
+        text = f"{fork.methods['compute_observations'][0].place} joins them in its own way: the groups here are the defaults"
     else:
         own: list[str] = []
-        groups = [None if part is None else _terms(part, own) for part in parts]
-        missing = f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where.place})" if own else ""
-        result.note("observations", f"{', '.join(groups[0] or []) or 'none of the terms here'}{missing}")
+        groups = [part and _terms(part, own) for part in fork.observations]
+        text = ", ".join(groups[0] or []) or "none of the terms here"
+        if own:
+            where = fork.methods["compute_observations"][0].place
+            text += f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where})"
+    result.note("observations", text)
     if groups[0]:
         for group, terms in (("actor", groups[0]), ("critic", groups[1] or groups[0])):
             result.put(f"observations.groups.{group}.terms", terms, "env.num_observations")
@@ -269,22 +243,22 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
     return terms
 
 
-def _by_number(number: Any, joints: int, points: int) -> tuple[list[str], int] | None:
+def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
     """Return the usual terms with exactly this many numbers, and their number of steps."""
+    joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
-    if points:
-        groups = {size + points: [*terms, "heights"] for size, terms in groups.items()} | groups
+    if result.get("terrain.measure_heights", False):
+        columns, rows = (result.get(path, []) for path in tables.OF_HEIGHTS)
+        groups = {size + len(columns) * len(rows): [*terms, "heights"] for size, terms in groups.items()} | groups
     for history in range(1, LONGEST_HISTORY + 1):
         for size, terms in groups.items():
             if number == history * size:
                 return terms, history
-    return None
+    return None, 1
 
 
-def _learning(result: Translation) -> None:
-    result.take(tables.OF_LEARNING)
-    if result.settings.get("train.runner.experiment_name") == "test":  # legged_gym's default
-        del result.settings["train.runner.experiment_name"]
+def _recurrent(result: Translation) -> None:
+    """Map the settings of a recurrent policy."""
     kind = result.theirs.get("runner.policy_class_name")
     if kind is not None and "Recurrent" in str(kind.value):
         result.done.add("runner.policy_class_name")
@@ -295,26 +269,28 @@ def _learning(result: Translation) -> None:
 
 def _random_model(result: Translation) -> None:
     """Map the randomised properties of forks; leave out those that are switched off."""
-    for switch, name, fields in tables.RANDOM_MODEL:
-        path = f"domain_rand.{name}"
-        on, values = result.theirs.get(f"domain_rand.randomize_{switch}"), result.theirs.get(path)
-        if on is None or values is None or on.value is not True:
-            continue
-        pair = result.numbers(path, [])
-        if len(pair) == 2:
-            result.done.add(f"domain_rand.randomize_{switch}")
-            for field in fields:
-                ours = field if "." in field else f"domain_rand.ranges.{field}"
-                result.put(ours, [-pair[1], -pair[0]] if field == tables.OFFSET else pair, path)
-        else:
-            result.done -= {path} - {entry.setting for entry in result.lost}
-    reach = result.theirs.get("domain_rand.rand_com_vec")
-    if reach is not None and result.get("domain_rand.randomize_base_com", False):
-        for axis, value in zip("xyz", result.numbers("domain_rand.rand_com_vec", []), strict=False):
-            result.put(f"domain_rand.ranges.base_com_{axis}", [-value, value], "domain_rand.rand_com_vec")
-    turn = result.theirs.get("env.rand_yaw_range")
-    if turn is not None and result.get("env.randomize_start_yaw", False) and is_number(turn.value):
-        result.put("init_state.yaw", [-turn.value, turn.value], "env.rand_yaw_range")
+    rand = "domain_rand."
+    for ours, names in tables.RANDOM_MODEL.items():
+        for switch, _, other in (name.partition(":") for name in names.split()):
+            switch, stem = f"{rand}randomize_{switch}", other or switch
+            path = result.has(f"{rand}{stem}_range", f"{rand}randomize_{stem}_range")
+            if path is None or switch not in result.theirs or result.theirs[switch].value is not True:
+                continue
+            pair = result.get(path, [])
+            if len(pair) != 2:
+                result.done -= {path} - {entry.setting for entry in result.lost}
+                continue
+            result.done.add(switch)
+            # An offset is added to the measured angle here, and to the target in forks.
+            pair = [0 - pair[1], 0 - pair[0]] if ours == "joint_offset" else pair
+            for field in ours.split():
+                result.put(field if "." in field else f"domain_rand.ranges.{field}", pair, path)
+    if result.has(f"{rand}rand_com_vec") and result.get(f"{rand}randomize_base_com", False):
+        for axis, value in zip("xyz", result.get(f"{rand}rand_com_vec", []), strict=False):
+            result.put(f"domain_rand.ranges.base_com_{axis}", [0 - value, value], f"{rand}rand_com_vec")
+    if result.has("env.rand_yaw_range") and result.get("env.randomize_start_yaw", False):
+        turn = result.get("env.rand_yaw_range", 0.0)
+        result.put("init_state.yaw", [0 - turn, turn], "env.rand_yaw_range")
     for path, found in result.theirs.items():
         section, _, name = path.partition(".")
         if found.value is False and path.startswith(("domain_rand.", "env.randomize_")):
@@ -324,16 +300,13 @@ def _random_model(result: Translation) -> None:
 
 def _delay(result: Translation) -> None:
     """Map delays of the motors' targets to physics steps."""
-    rand, steps = "domain_rand.", None
-    times, lag = result.theirs.get(f"{rand}delay_ms_range"), result.theirs.get(f"{rand}lag_timesteps")
-    if times is not None and result.get(f"{rand}randomize_action_delay", False):
-        pair = result.numbers(f"{rand}delay_ms_range", [])
-        steps = [round(ms / 1000 / result.number("sim.dt", 0.005)) for ms in pair]
-    elif lag is not None and result.get(f"{rand}randomize_lag_timesteps", False) and isinstance(lag.value, int):
-        steps = [lag.value] * 2
-        result.done.add(f"{rand}lag_timesteps")
-    elif result.theirs.get(f"{rand}delay") is not None and result.get(f"{rand}delay") is True:
-        steps = [0, int(result.number("control.decimation", 4)) - 1]
+    rand, steps, lag = "domain_rand.", None, result.theirs.get("domain_rand.lag_timesteps")
+    if result.has(f"{rand}delay_ms_range") and result.get(f"{rand}randomize_action_delay", False):
+        steps = [round(ms / 1000 / result.get("sim.dt", 0.005)) for ms in result.get(f"{rand}delay_ms_range", [])]
+    elif lag is not None and isinstance(lag.value, int) and result.get(f"{rand}randomize_lag_timesteps", False):
+        steps = [result.get(f"{rand}lag_timesteps")] * 2
+    elif result.has(f"{rand}delay") and result.get(f"{rand}delay") is True:
+        steps = [0, int(result.get("control.decimation", 4.0)) - 1]
         result.put("control.actuator.delay_varies", True, f"{rand}delay")
     if steps is not None:
         result.put("control.actuator.delay", steps, f"{rand}delay", "in physics steps")
@@ -342,14 +315,11 @@ def _delay(result: Translation) -> None:
 def _hooks(result: Translation, fork: Fork) -> None:
     """Name the fork's own methods whose content no setting carries over, and the commands with another meaning."""
     own = {name: method for name, methods in fork.methods.items() for method in methods if not method.original}
-    hooks = [
-        f"{name} ({own[name].place})" for name in own if not name.startswith("_reward_") and name != "compute_observations"
-    ]
+    hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:
         result.note("methods", f"the fork's own, to be moved by hand (docs/migrating.md): {', '.join(hooks)}")
-    readers = [
-        f"{name} ({method.place})" for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING
-    ]
+    fourth = [name for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING]
+    readers = [f"{name} ({own[name].place})" for name in fourth]
     if readers:
         result.note("commands", f"commands[:, 3] is the heading here, and there are no others; compare {', '.join(readers)}")
 
@@ -357,18 +327,16 @@ def _hooks(result: Translation, fork: Fork) -> None:
 def _rest(result: Translation) -> None:
     """List the settings of the file that no other function handled."""
     for path, found in result.theirs.items():
-        if path in result.done or path in tables.OF_THE_ROBOT or not result.given(path):
+        changed = found.why_unknown or found.value != value_at(OF_LEGGED_GYM, path)
+        if path in result.done or re.match(tables.OF_THE_ROBOT, path) or not changed:
             continue
         reason = next((text for pattern, text in tables.NEAR.items() if re.match(pattern, path, re.IGNORECASE)), "")
-        if path.startswith("rewards.") and not reason and not found.why_unknown and _is_plain(found.value):
+        items = found.value if isinstance(found.value, list) else [found.value]
+        plain = not found.why_unknown and all(isinstance(item, bool | int | float | str) for item in items)
+        if path.startswith("rewards.") and plain and not reason:
             name = path.removeprefix("rewards.").replace(".", "_")
             result.put(f"custom.{name}", found.value, path, f"self.cfg.custom['{name}']; theirs is self.cfg.{path}")
         elif re.match(tables.MINOR, path):
             result.minor.append(path)
         else:
             result.lose(path, found.why_unknown or reason)
-
-
-def _is_plain(value: Any) -> bool:
-    flat: Iterable[Any] = value if isinstance(value, list) else [value]
-    return all(isinstance(item, bool | int | float | str) for item in flat)

@@ -1,8 +1,11 @@
-"""Reading of a fork's configuration: `child.py` runs it in another process, and this module takes what it prints."""
+"""Reading of a fork's configuration: `child.py` runs it in another process, and this module takes what it prints.
+
+`legged_gym.yaml` has legged_gym's classes (`known`: name, base class, values), so that files that extend them run without it;
+rsl_rl's defaults; and digests of legged_gym's methods, since names alone say nothing of a fork's formulas.
+"""
 
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -11,26 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from legged.config.checks import shown
+from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
-from legged.migration.legged_gym_defaults import DIGESTS, KNOWN, LEFT_OUT
 from legged.process.paths import relative
 
 CHILD = Path(__file__).with_name("child.py")
 LONGEST_S = 600
 """Largest time that the fork's files may take [s]."""
-SAID = 2000
-"""Largest length of the output of the fork's files that is looked at, in bytes."""
-
-
-@dataclass(frozen=True)
-class Place:
-    """A line of a file."""
-
-    file: str
-    line: int
-
-    def __str__(self) -> str:
-        return f"{relative(Path(self.file))}:{self.line}" if self.line else self.file
+ORIGINAL = read_yaml(CHILD.with_name("legged_gym.yaml"))
+DEFAULTS: dict[str, Any] = ORIGINAL["known"]["LeggedRobotCfg"][1] | ORIGINAL["known"]["LeggedRobotCfgPPO"][1]
+"""Values of legged_gym's two base classes."""
+DIGESTS: dict[str, str] = ORIGINAL["digests"]
+"""Method of legged_gym -> digest of its text (`child.method`)."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +34,8 @@ class Found:
 
     value: Any
     """The value; None if it is unknown."""
-    place: Place
+    place: str
+    """File and line."""
     why_unknown: str = ""
     """Reason why the value is unknown; empty if it is known."""
 
@@ -48,7 +44,7 @@ class Found:
 class Method:
     """A method of the environment's class."""
 
-    place: Place
+    place: str
     original: bool
     """True if it is legged_gym's method of that name."""
     reads: tuple[str, ...]
@@ -80,53 +76,39 @@ def read_fork(path: Path, asked: str | None) -> Fork:
     Raises:
         ConfigError: the file fails, or has no configuration, or several and `asked` chooses none of them.
     """
-    data = _run({"file": str(path.resolve()), "task": asked, "known": KNOWN, "methods": list(DIGESTS)}, path)
+    data = run_child(path, asked)
     if "error" in data:
-        place = Place(*data["place"]) if data["place"][0] else relative(path)
+        place = _place(*data["place"]) if data["place"][0] else relative(path)
         raise ConfigError(f"{place}: the file does not run: {data['error']}{data['said']}")
     if "settings" not in data:
         raise _no_choice(path, asked, data["classes"], data["tasks"])
-    learning = {name: _found(entry) for name, entry in data["learning"].items()}
-    for section, values in LEFT_OUT.items():
-        named = [found.place for name, found in learning.items() if name.startswith(f"{section}.")]
+    settings = {path: Found(value, _place(*where), why) for path, (value, *where, why) in data["settings"].items()}
+    for section, values in ORIGINAL["rsl_rl"].items():
+        named = [found.place for name, found in settings.items() if name.startswith(f"{section}.")]
         if named:  # a section without base class leaves missing settings to rsl_rl
-            place = Place(f"rsl_rl's default; {named[0]}", 0)
-            learning = {f"{section}.{name}": Found(value, place) for name, value in values.items()} | learning
-    parts = [data["environment"], data["learner"] or "no learner's configuration"]
+            missing = {f"{section}.{name}": Found(value, f"rsl_rl's default; {named[0]}") for name, value in values.items()}
+            settings = missing | settings
     built_in = f"; {', '.join(sorted(data['built_in']))} as legged_gym v1.0.2 has them" if data["built_in"] else ""
     methods = {
-        name: [Method(Place(*m["place"]), m["digest"] == DIGESTS.get(name), tuple(m["reads"])) for m in entries]
+        name: [Method(_place(*m["place"]), m["digest"] == DIGESTS.get(name), tuple(m["reads"])) for m in entries]
         for name, entries in data["methods"].items()
     }
-    return Fork(
-        task=data.get("given") or (_snake(data["task"]) if data["task"] in data["classes"] else data["task"]),
-        described=f"{' and '.join(parts)}{built_in}",
-        settings={name: _found(entry) for name, entry in data["settings"].items()} | learning,
-        methods=methods,
-        observations=data["observations"],
-        terrains=data["terrains"],
-    )
+    names = [*data["names"], "no learner's configuration"][:2]
+    return Fork(data["task"], f"{' and '.join(names)}{built_in}", settings, methods, data["observations"], data["terrains"])
 
 
-def _snake(name: str) -> str:
-    """Return a task name for a class: 'GO2RoughCfg' -> 'go2_rough'."""
-    name = re.sub(r"(Cfg|Config)$", "", name) or name
-    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
-    return name.lower().strip("_") or "task"
+def _place(file: str, line: int) -> str:
+    """Return file and line as text; line 0 stands for a class that has no file."""
+    return f"{relative(Path(file))}:{line}" if line else file
 
 
-def _found(entry: list[Any]) -> Found:
-    value, file, line, why = entry
-    return Found(value, Place(file, line), why)
-
-
-def _run(request: dict[str, Any], path: Path) -> dict[str, Any]:
+def run_child(path: Path, asked: str | None) -> dict[str, Any]:
     """Return the child's answer, with the last line of the output of the user's files as `said`."""
-    command = [sys.executable, "-P", str(CHILD)]  # without the child's folder among the modules
+    request = {"file": str(path.resolve()), "task": asked, "known": ORIGINAL["known"], "methods": list(DIGESTS)}
     with tempfile.TemporaryFile() as output:
         try:
             done = subprocess.run(
-                command,
+                [sys.executable, "-P", str(CHILD)],  # without the child's folder among the modules
                 input=json.dumps(request).encode(),
                 stdout=subprocess.PIPE,
                 stderr=output,
@@ -136,7 +118,7 @@ def _run(request: dict[str, Any], path: Path) -> dict[str, Any]:
             )
         except subprocess.TimeoutExpired:
             raise ConfigError(f"{relative(path)}: the file did not end within {LONGEST_S} s") from None
-        output.seek(max(0, output.seek(0, os.SEEK_END) - SAID))
+        output.seek(0)
         lines = output.read().decode(errors="replace").strip().splitlines()
     said = f"; it printed: {lines[-1]}" if lines else ""
     try:

@@ -38,26 +38,26 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
     """Set the task's gains, and return entries of robot.yaml: those that differ from the entries of `robot`, or all without
     one.
     """
-    gains = {name: result.table(f"control.{name}") for name in ("stiffness", "damping")}
+    gains = {name: result.get(f"control.{name}", {}) for name in ("stiffness", "damping")}
     if result.get("control.use_actuator_network", False) or result.get("control.control_type") == "actuator_net":
         gains = {}  # torques come from a network
     entries: dict[str, Any] = {}
     patterns = {ours: _patterns(result, theirs) for theirs, ours in LISTS}
-    position, pose = result.numbers(POSITION, []), result.table(POSE)
-    if result.numbers(ROTATION, [0, 0, 0, 1]) != [0, 0, 0, 1]:
+    position, pose = result.get(POSITION, []), result.get(POSE, {})
+    if result.get(ROTATION, [0, 0, 0, 1]) != [0, 0, 0, 1]:
         result.lose(ROTATION, "robots start level here, with a heading in init_state.yaw")
     if len(position) == 3:
-        entries["spawn_height"] = float(position[2])
+        if robot is None or abs(position[2] - robot.file.spawn_height) >= 1e-6:
+            entries["spawn_height"] = float(position[2])
         if any(position[:2]):
             result.lose(POSITION, "robots start on their tiles' middles here; the height alone is taken")
-    if robot is None:
-        for name, table in gains.items():
-            result.put(f"control.{name}", table, f"control.{name}") if table else None
-        return entries | ({"default_joint_angles": pose} if pose else {}) | {k: v for k, v in patterns.items() if v}
     for name, table in gains.items():
-        _gains(result, robot, name, table)
-    if abs(entries.get("spawn_height", robot.file.spawn_height) - robot.file.spawn_height) < 1e-6:
-        entries.pop("spawn_height", None)
+        if robot is not None:
+            _gains(result, robot, name, table)
+        elif table:
+            result.put(f"control.{name}", table, f"control.{name}")
+    if robot is None:
+        return entries | {name: value for name, value in {"default_joint_angles": pose, **patterns}.items() if value}
     unknown = [name for name in pose if name not in robot.joint_names]
     if unknown:
         result.lose(POSE, f"{robot.name} has no {', '.join(unknown)} (joints: {', '.join(robot.joint_names)})")
@@ -65,9 +65,8 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
     if not np.allclose(list(angles.values()), robot.default_dof_pos, atol=1e-6):
         entries["default_joint_angles"] = angles
     shapes = Shapes.of(mujoco.MjModel.from_xml_path(str(robot.model_path)), robot.file.feet, "feet")
-    for (theirs, ours), own in zip(
-        LISTS, (robot.feet_indices, robot.penalised_indices, robot.termination_indices), strict=True
-    ):
+    of_robot = (robot.feet_indices, robot.penalised_indices, robot.termination_indices)
+    for (theirs, ours), own in zip(LISTS, of_robot, strict=True):
         if theirs in result.theirs and (patterns[ours] or ours != "feet"):
             kept, found = _contacts(result, theirs, patterns[ours], shapes, robot.name)
             if tuple(sorted(found)) != tuple(own) and (found or not patterns[ours]):
@@ -83,8 +82,8 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
 def _patterns(result: Translation, path: str) -> list[str]:
     """Return a list of name patterns; a fork may give a single one as text."""
     value = result.get(path)
-    found = [value] if isinstance(value, str) else [str(item) for item in value] if isinstance(value, list) else []
-    return [name for name in found if name and name != "None"]
+    names = value if isinstance(value, list) else [value] if isinstance(value, str) else []
+    return [str(name) for name in names if name and name != "None"]
 
 
 def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]) -> None:

@@ -1,120 +1,84 @@
 """Tables of legged_gym's settings, and of its forks', and of the settings here."""
 
 
-def _each(theirs: str, ours: str, names: str) -> dict[str, str]:
-    return {f"{theirs}.{name}": f"{ours}.{name}" for name in names.split()}
+def _pairs(text: str) -> dict[str, str]:
+    """Return setting -> setting here. A line has a section, the section here, and names; theirs=ours where they differ."""
+    pairs: dict[str, str] = {}
+    for line in text.strip().splitlines():
+        sections, _, names = line.partition(": ")
+        theirs, ours = sections.split(" -> ")
+        for old, _, new in (name.partition("=") for name in names.split()):
+            pairs[f"{theirs}.{old}"] = f"{ours}.{new or old}"
+    return pairs
 
 
 MOVED = {
+    **{f"{name}_scales.": f"{section}.{name}_scales." for section, name in (("normalization", "obs"), ("noise", "noise"))},
     "reward_scales.": "rewards.scales.",
-    "obs_scales.": "normalization.obs_scales.",
-    "noise_scales.": "noise.noise_scales.",
-    "commands.lin_vel_x": "commands.ranges.lin_vel_x",
-    "commands.lin_vel_y": "commands.ranges.lin_vel_y",
-    "commands.ang_vel_yaw": "commands.ranges.ang_vel_yaw",
-    "commands.heading": "commands.ranges.heading",
+    **_pairs("commands -> commands.ranges: lin_vel_x lin_vel_y ang_vel_yaw heading"),
 }
 """Beginning of a setting's path in a fork, or a whole path without a dot at its end -> legged_gym's path."""
 
-SAME: dict[str, str] = {
-    **_each("env", "env", "num_envs episode_length_s"),
-    "commands.resampling_time": "commands.resampling_time_s",
-    "commands.heading_command": "commands.heading_command",
-    **_each("commands.ranges", "commands.ranges", "lin_vel_x lin_vel_y ang_vel_yaw heading"),
-    **_each("control", "control", "control_type action_scale decimation"),
-    **_each("domain_rand", "domain_rand", "randomize_friction randomize_base_mass added_mass_range"),
-    "domain_rand.randomize_payload_mass": "domain_rand.randomize_base_mass",
-    "domain_rand.payload_mass_range": "domain_rand.added_mass_range",
-    **_each("domain_rand", "domain_rand", "push_robots push_interval_s max_push_vel_xy"),
-    **_each("rewards", "rewards", "only_positive_rewards soft_dof_pos_limit soft_dof_vel_limit soft_torque_limit"),
-    **_each("rewards", "rewards", "base_height_target max_contact_force"),
-    "normalization.clip_observations": "observations.clip",
-    "normalization.clip_actions": "control.clip_actions",
-    "noise.add_noise": "observations.add_noise",
-    "noise.noise_level": "observations.noise_level",
-    "noise.noise_scales.gravity": "observations.noise.projected_gravity",
-    **{
-        f"{section}.{theirs}": f"observations.{kind}.{ours}"
-        for section, kind in (("normalization.obs_scales", "scales"), ("noise.noise_scales", "noise"))
-        for theirs, ours in (
-            ("lin_vel", "base_lin_vel"),
-            ("ang_vel", "base_ang_vel"),
-            ("dof_pos", "dof_pos"),
-            ("dof_vel", "dof_vel"),
-            ("height_measurements", "heights"),
-        )
-    },
-    "sim.dt": "sim.dt",
-    "domain_rand.init_dof_pos_ratio_range": "init_state.dof_pos_factor",
-    "domain_rand.init_base_vel_range": "init_state.base_velocity",
-    "commands.zero_command_prob": "commands.standing_share",
-}
-"""Setting of an environment's configuration -> setting here of the same meaning."""
+SAME = {"seed": "env.seed"} | _pairs("""
+env -> env: num_envs episode_length_s
+commands -> commands: resampling_time=resampling_time_s heading_command zero_command_prob=standing_share
+commands.ranges -> commands.ranges: lin_vel_x lin_vel_y ang_vel_yaw heading
+control -> control: control_type action_scale decimation
+domain_rand -> domain_rand: randomize_friction randomize_base_mass added_mass_range
+domain_rand -> domain_rand: push_robots push_interval_s max_push_vel_xy
+domain_rand -> domain_rand: randomize_payload_mass=randomize_base_mass payload_mass_range=added_mass_range
+domain_rand -> init_state: init_dof_pos_ratio_range=dof_pos_factor init_base_vel_range=base_velocity
+rewards -> rewards: only_positive_rewards soft_dof_pos_limit soft_dof_vel_limit soft_torque_limit
+rewards -> rewards: base_height_target max_contact_force
+normalization -> observations: clip_observations=clip
+normalization -> control: clip_actions
+normalization.obs_scales -> observations.scales: lin_vel=base_lin_vel ang_vel=base_ang_vel dof_pos dof_vel
+normalization.obs_scales -> observations.scales: height_measurements=heights
+noise -> observations: add_noise noise_level
+noise.noise_scales -> observations.noise: lin_vel=base_lin_vel ang_vel=base_ang_vel gravity=projected_gravity
+noise.noise_scales -> observations.noise: dof_pos dof_vel height_measurements=heights
+sim -> sim: dt
+policy -> train.policy: init_noise_std actor_hidden_dims critic_hidden_dims activation
+algorithm -> train.algorithm: value_loss_coef use_clipped_value_loss clip_param entropy_coef gamma lam desired_kl
+algorithm -> train.algorithm: num_learning_epochs num_mini_batches learning_rate schedule max_grad_norm
+runner -> train.runner: num_steps_per_env max_iterations save_interval experiment_name run_name
+""")
+"""Setting of a fork -> setting here of the same meaning."""
+OF_TERRAIN = _pairs("""
+terrain -> terrain: horizontal_scale border_size curriculum max_init_terrain_level
+terrain -> terrain: terrain_length terrain_width num_rows num_cols
+""")
+"""More such settings, for ground that is not a plane; then those of measured heights, and of recurrent policies."""
+OF_HEIGHTS = _pairs("terrain -> terrain: measured_points_x measured_points_y")
+OF_RECURRENT = _pairs("policy -> train.policy: rnn_type rnn_hidden_size=rnn_hidden_dim rnn_num_layers")
 ABSENT = {
-    "domain_rand.randomize_friction": False,
-    "domain_rand.push_robots": False,
-    "rewards.only_positive_rewards": False,
-    "noise.add_noise": False,
-    "commands.heading_command": False,
-    "commands.ranges.lin_vel_x": [0.0, 0.0],
-    "commands.ranges.lin_vel_y": [0.0, 0.0],
-    "commands.ranges.ang_vel_yaw": [0.0, 0.0],
+    **dict.fromkeys(("domain_rand.randomize_friction", "domain_rand.push_robots", "rewards.only_positive_rewards"), False),
+    **dict.fromkeys(("noise.add_noise", "commands.heading_command"), False),
+    **{f"commands.ranges.{name}": [0.0, 0.0] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")},
     **{f"noise.noise_scales.{name}": 0.0 for name in ("gravity", "lin_vel", "ang_vel", "dof_pos", "dof_vel")},
 }
 """Setting -> value that it has here if a fork has no such setting. The defaults here would add what the fork does not do."""
-
-OF_TERRAIN = _each(
-    "terrain",
-    "terrain",
-    "horizontal_scale border_size curriculum max_init_terrain_level terrain_length terrain_width num_rows num_cols",
-)
-"""More such settings, for ground that is not a plane; then those of measured heights."""
-OF_HEIGHTS = _each("terrain", "terrain", "measured_points_x measured_points_y")
-OF_LEARNING: dict[str, str] = {
-    "seed": "env.seed",
-    **_each("policy", "train.policy", "init_noise_std actor_hidden_dims critic_hidden_dims activation"),
-    **_each("algorithm", "train.algorithm", "value_loss_coef use_clipped_value_loss clip_param entropy_coef gamma lam"),
-    **_each("algorithm", "train.algorithm", "num_learning_epochs num_mini_batches learning_rate schedule desired_kl"),
-    "algorithm.max_grad_norm": "train.algorithm.max_grad_norm",
-    **_each("runner", "train.runner", "num_steps_per_env max_iterations save_interval experiment_name run_name"),
+RANDOM_MODEL = {
+    "link_mass": "link_mass",
+    "restitution": "restitution",
+    "motor_strength": "motor_strength motor:motor_strength motor_torque",
+    "base_com_x base_com_y base_com_z": "com_displacement base_com:added_com",
+    "p_gain": "kp Kp Kp_factor gains:stiffness_multiplier",
+    "d_gain": "kd Kd Kd_factor gains:damping_multiplier",
+    "joint_offset": "motor_offset default_dof_pos",
+    "joint_friction": "joint_friction",
+    "init_state.dof_pos_factor": "initial_joint_pos",
 }
-"""Setting of a learner's configuration -> setting here."""
-OF_RECURRENT = {
-    "policy.rnn_type": "train.policy.rnn_type",
-    "policy.rnn_hidden_size": "train.policy.rnn_hidden_dim",
-    "policy.rnn_num_layers": "train.policy.rnn_num_layers",
-}
-"""Settings of recurrent policies (`runner.policy_class_name`) -> setting here of the same meaning."""
-
-RANDOM_MODEL = (
-    ("link_mass", "link_mass_range", ("link_mass",)),
-    ("restitution", "restitution_range", ("restitution",)),
-    ("motor_strength", "motor_strength_range", ("motor_strength",)),
-    ("motor", "motor_strength_range", ("motor_strength",)),
-    ("motor_torque", "randomize_motor_torque_range", ("motor_strength",)),
-    ("com_displacement", "com_displacement_range", ("base_com_x", "base_com_y", "base_com_z")),
-    ("base_com", "added_com_range", ("base_com_x", "base_com_y", "base_com_z")),
-    *(
-        entry
-        for theirs, ours in (("kp", "p_gain"), ("kd", "d_gain"))
-        for name in (theirs, theirs.capitalize(), f"{theirs.capitalize()}_factor")
-        for entry in ((name, f"{name}_range", (ours,)), (name, f"randomize_{name}_range", (ours,)))
-    ),
-    ("gains", "stiffness_multiplier_range", ("p_gain",)),
-    ("gains", "damping_multiplier_range", ("d_gain",)),
-    ("motor_offset", "motor_offset_range", ("joint_offset",)),
-    ("default_dof_pos", "randomize_default_dof_pos_range", ("joint_offset",)),
-    ("joint_friction", "joint_friction_range", ("joint_friction",)),
-    ("initial_joint_pos", "initial_joint_pos_range", ("init_state.dof_pos_factor",)),
+"""Properties or settings here -> names of forks: randomize_<name> switches on <name>_range or randomize_<name>_range. After a
+colon stands the range's name, if it is another.
+"""
+HISTORY = (
+    *("env.frame_stack", "env.obs_history_length", "env.num_observation_history"),
+    *("env.history_len", "env.include_history_steps"),
 )
-"""Randomised properties of forks: randomize_<first> switches on the range <second>; the third are the properties or settings
-here."""
-OFFSET = "joint_offset"
-"""Property here that is added to the measured angle. A fork's offset is added to the target, so its sign is the other one."""
-HISTORY = ("frame_stack", "obs_history_length", "num_observation_history", "history_len", "include_history_steps")
-"""Settings of `env`: number of steps of the policy's observations."""
-ONE_STEP = ("num_one_step_observations", "num_single_obs", "num_one_step_obs")
-"""Settings of `env`: number of the policy's observations in one step."""
+"""Settings: number of steps of the policy's observations."""
+ONE_STEP = ("env.num_one_step_observations", "env.num_single_obs", "env.num_one_step_obs")
+"""Settings: number of the policy's observations in one step."""
 
 NEAR = {
     r"init_state\.(lin|ang)_vel$|env\.randomize_start_vel": "init_state.base_velocity is the range that it is drawn from",
@@ -162,38 +126,33 @@ MINOR = (
 )
 """Settings of Isaac Gym, of drawing, and of the command line, which change no task here."""
 
-OF_THE_ROBOT = {
-    *("init_state.pos", "init_state.rot", "init_state.default_joint_angles", "control.stiffness", "control.damping"),
-    *("control.actuator_net_file", "asset.file", "asset.name", "asset.foot_name", "asset.penalize_contacts_on"),
-    "asset.terminate_after_contacts_on",
-}
+OF_THE_ROBOT = (
+    r"init_state\.(pos|rot|default_joint_angles)$|control\.(stiffness|damping|actuator_net_file)"
+    r"|asset\.(file|name|foot_name|penalize_contacts_on|terminate_after_contacts_on)$"
+)
 """Settings that go into robot.yaml, or into the task's control tables."""
 
-TERRAINS = (
-    {"slope_up": 0.5, "slope_down": 0.5},
-    *({name: 1.0} for name in ("rough_slope_down", "stairs_up", "stairs_down", "obstacles", "stepping_stones", "gap", "pit")),
-)
-"""Meaning of each entry of legged_gym's `terrain_proportions`: terrain type here -> its part of that entry."""
-TERRAIN_FUNCTIONS: dict[tuple[str, ...], tuple[str, str, str]] = {
-    (): ("flat", "flat", "flat"),
-    ("pyramid_sloped_terrain",): ("slope_up", "flat", "slope_down"),
-    ("pyramid_sloped_terrain", "random_uniform_terrain"): ("rough_slope_up", "", "rough_slope_down"),
-    ("pyramid_stairs_terrain",): ("stairs_up", "flat", "stairs_down"),
-    **{(f"{name}_terrain",): (name,) * 3 for name in ("stepping_stones", "gap", "pit")},
-    ("discrete_obstacles_terrain",): ("obstacles",) * 3,
+TERRAINS = [
+    *(["slope_up", "slope_down"], ["rough_slope_down"], ["stairs_up"], ["stairs_down"]),
+    *(["obstacles"], ["stepping_stones"], ["gap"], ["pit"]),
+]
+"""Terrain types here of each entry of legged_gym's `terrain_proportions`."""
+TERRAIN_FUNCTIONS = {
+    "": ["flat"] * 3,
+    "pyramid_sloped_terrain": ["slope_up", "flat", "slope_down"],
+    "pyramid_sloped_terrain + random_uniform_terrain": ["rough_slope_up", "", "rough_slope_down"],
+    "pyramid_stairs_terrain": ["stairs_up", "flat", "stairs_down"],
+    **{f"{name}_terrain": [name] * 3 for name in ("stepping_stones", "gap", "pit")},
+    "discrete_obstacles_terrain": ["obstacles"] * 3,
 }
 """Isaac Gym's terrain functions -> type here, for a negative, no, and a positive slope or height of steps. With a positive
 one the middle of a tile, where robots start, is its highest part.
 """
 
 PARTS = {
-    "base_lin_vel": {"self.base_lin_vel"},
-    "base_ang_vel": {"self.base_ang_vel"},
-    "projected_gravity": {"self.projected_gravity"},
+    **{name: {f"self.{name}"} for name in ("base_lin_vel", "base_ang_vel", "projected_gravity", "dof_vel", "actions")},
     "commands": {"self.commands[:, :3]"},
     "dof_pos": {"self.dof_pos", "self.default_dof_pos"},
-    "dof_vel": {"self.dof_vel"},
-    "actions": {"self.actions"},
     "heights": {"torch.clip", "self.root_states[:, 2].unsqueeze", "1", "0.5", "self.measured_heights", "-1", "1.0"},
 }
 """Observation term here -> names and numbers, but for scales, from which a fork computes the same."""

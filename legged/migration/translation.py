@@ -1,7 +1,7 @@
 """A task made from a fork's configuration: settings, comments on them, and lost settings."""
 
-import math
-from collections.abc import Callable, Mapping
+import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,21 +11,18 @@ from legged.config.loader import nest, to_dict
 from legged.config.origins import Origins
 from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
-from legged.migration.legged_gym_defaults import DEFAULTS as OF_LEGGED_GYM
-from legged.migration.reading import Found, Place
+from legged.migration.reading import Found
 
 DEFAULTS = to_dict(LeggedConfig())
-LARGEST_NUMBER = 1e12
-"""Largest number that a setting can plausibly have."""
-PI = 3.14
-"""legged_gym's value for half a turn."""
+LIKE_DEFAULTS = {"commands.ranges.heading": [-3.14, 3.14], "train.runner.experiment_name": "test"}
+"""Path here -> value that legged_gym has in place of the default here."""
 
 
 @dataclass(frozen=True)
 class Lost:
     """A setting that has no counterpart here, or another meaning."""
 
-    place: Place
+    place: str
     setting: str
     value: str
     reason: str
@@ -55,41 +52,29 @@ class Translation:
     """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return a value of the file; `default` if it is not set or unknown. For settings that are computed from several
-        values.
+        """Return a value of the file; `default` if it is not set or unknown. With a default that is a float, a list or a
+        table, it must be a number, a list of numbers, or a table of names and numbers; another value is recorded as lost.
         """
         self.done.add(path)
-        found = self.theirs.get(path)
-        if found is not None and found.why_unknown:
-            self.lose(path, found.why_unknown)
-        return default if found is None or found.why_unknown else found.value
-
-    def number(self, path: str, default: float) -> float:
-        """Return a value of the file that must be a number."""
-        return self._of_kind(path, default, is_number, "a number")
-
-    def numbers(self, path: str, default: list[float]) -> list[float]:
-        """Return a value of the file that must be a list of numbers."""
-        return list(
-            self._of_kind(path, default, lambda x: isinstance(x, list) and all(map(is_number, x)), "a list of numbers")
-        )
-
-    def table(self, path: str) -> dict[str, float]:
-        """Return a value of the file that must be a table of names and numbers."""
-        found = self._of_kind(path, {}, _is_table, "names and their numbers")
-        return {name: float(value) for name, value in found.items()}
-
-    def _of_kind(self, path: str, default: Any, is_of_kind: Callable[[Any], bool], kind: str) -> Any:
-        value = self.get(path, default)
-        if not is_of_kind(value):
-            self.lose(path, f"expected {kind}")
+        found, kind, fits = self.theirs.get(path), "", True
+        if found is None:
+            return default
+        value = found.value
+        if isinstance(default, float):
+            kind, fits = "a number", is_number(value)
+        elif isinstance(default, list):
+            kind, fits = "a list of numbers", isinstance(value, list) and all(map(is_number, value))
+        elif isinstance(default, dict):
+            kind, fits = "names and their numbers", isinstance(value, dict) and all(map(is_number, value.values()))
+            value = {name: float(number) for name, number in value.items()} if fits else value
+        if found.why_unknown or not fits:
+            self.lose(path, found.why_unknown or f"expected {kind}")
             return default
         return value
 
-    def given(self, path: str) -> bool:
-        """Return True if the file sets it to another value than legged_gym does."""
-        found = self.theirs[path]
-        return bool(found.why_unknown) or plain(found.value) != plain(value_at(OF_LEGGED_GYM, path))
+    def has(self, *paths: str) -> str | None:
+        """Return the first of these settings that the file has."""
+        return next((path for path in paths if path in self.theirs), None)
 
     def lose(self, path: str, reason: str) -> None:
         """Record a setting of the file as lost."""
@@ -102,7 +87,6 @@ class Translation:
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
         """Set `path` here, unless the value is the default; a value that the schema refuses is recorded as lost."""
         self.done.add(theirs)
-        value = plain(value)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")
         except ConfigError as error:
@@ -110,10 +94,12 @@ class Translation:
             self.lose(theirs, f"{path} takes no such value: {reason}") if theirs in self.theirs else None
             return
         default = value_at(DEFAULTS, path)
-        if _same(value, 1.0 if default is None and path.startswith("observations.scales.") else default):
+        if default is None and path.startswith("observations.scales."):
+            default = 1.0
+        if value in (default, LIKE_DEFAULTS.get(path, default)):
             self.settings.pop(path, None)  # remove the value from another setting of the file
             return
-        self.settings[path] = value
+        self.settings[path] = copy.deepcopy(value)  # YAML marks a list that is there twice
         if comment:
             self.comments[path] = comment
 
@@ -121,11 +107,9 @@ class Translation:
         """Map the settings of a table that the file sets."""
         for theirs, ours in table.items():
             found = self.theirs.get(theirs)
-            if found is None:
-                continue
-            if found.why_unknown:
+            if found is not None and found.why_unknown:
                 self.lose(theirs, found.why_unknown)
-            else:
+            elif found is not None:
                 self.put(ours, found.value, theirs)
 
     def note(self, subject: str, *lines: str) -> None:
@@ -134,28 +118,5 @@ class Translation:
 
 
 def is_number(value: Any) -> bool:
-    """Return True if a value is a finite number and not a bool."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST_NUMBER
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(name, str) and is_number(item) for name, item in value.items())
-
-
-def plain(value: Any) -> Any:
-    """Return a value that can be compared and written: lists for tuples, no negative zeros."""
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    return 0.0 if value == 0 and isinstance(value, float) else value
-
-
-def _same(value: Any, default: Any) -> bool:
-    """Return True if a value is the default; half a turn is 3.14 in legged_gym."""
-    if isinstance(value, list) and isinstance(default, list | tuple) and len(value) == len(default):
-        return all(_same(a, b) for a, b in zip(value, default, strict=True))
-    if isinstance(value, int | float) and isinstance(default, int | float) and not isinstance(value, bool):
-        half_turn = abs(value) == PI and abs(abs(default) - math.pi) < 1e-6 and value * default > 0
-        return value == default or half_turn
-    return bool(value == default)
+    """Return True if a value is a number of plausible size, and not a bool."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12

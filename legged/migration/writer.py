@@ -10,7 +10,7 @@ from legged.config.yaml_files import dump
 
 WIDTH = 120
 FIRST = ("robot", "env", "terrain", "commands", "init_state", "control")
-ORDER = [*FIRST, *(field.name for field in dataclasses.fields(LeggedConfig) if field.name not in FIRST)]
+ORDER = list(dict.fromkeys((*FIRST, *(field.name for field in dataclasses.fields(LeggedConfig)))))
 """Sections of a task, in the order of the file."""
 
 

@@ -12,7 +12,7 @@ from importing_fixtures import urdf
 from legged.cli import main as legged
 from legged.cli import migrate
 from legged.config.yaml_files import read_yaml
-from legged.migration import legged_gym_defaults, reading
+from legged.migration import reading
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
 
@@ -145,12 +145,9 @@ def fork(monkeypatch):
         return "fork/envs/dog_config.py"
 
     fork()
-    known = legged_gym_defaults.KNOWN, list(legged_gym_defaults.DIGESTS)
-    found = reading._run(
-        {"file": str(Path("fork/envs/dog.py").resolve()), "task": "dog", "known": known[0], "methods": known[1]}, Path()
-    )
+    found = reading.run_child(Path("fork/envs/dog.py"), "dog")
     digest = found["methods"]["_reward_lin_vel_z"][0]["digest"]
-    monkeypatch.setitem(legged_gym_defaults.DIGESTS, "_reward_lin_vel_z", digest)
+    monkeypatch.setitem(reading.DIGESTS, "_reward_lin_vel_z", digest)
     return fork
 
 
@@ -181,6 +178,16 @@ def test_formulas_of_the_forks_own_get_no_scale_until_their_methods_are_pasted(f
     )
     assert "rewards: 1 of 5 scales are mapped, with legged_gym's formulas; 4 wait" in result.out
     built(result)
+
+
+def test_a_formula_of_legged_gyms_with_a_comment_at_the_margin_is_recognised(fork, migrated):
+    """Such a comment made the method a fork's own."""
+    path, env = fork(), Path("fork/envs/dog.py")
+    body = "        return self.base_lin_vel[:, 2] ** 2"
+    assert body in env.read_text()
+    env.write_text(env.read_text().replace(body, f"# return self.base_lin_vel[:, 2]\n{body}"))
+    result = migrated(textwrap.dedent(CONFIG), path=path)
+    assert "rewards: 1 of 5 scales are mapped, with legged_gym's formulas; 4 wait" in result.out
 
 
 def test_the_first_lines_are_those_that_matter(fork, migrated):

@@ -11,9 +11,8 @@ from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
 from legged.envs import LeggedRobot
-from legged.migration.legged_gym_defaults import DEFAULTS, DIGESTS
 from legged.migration.mapping import map_settings
-from legged.migration.reading import Fork, Found, Place
+from legged.migration.reading import DEFAULTS, DIGESTS, Fork, Found
 from legged.migration.robot_entries import map_robot
 from legged.migration.writer import robot_yaml, task_yaml
 from legged.robots.robot import load_robot
@@ -208,14 +207,14 @@ def spoiled(data: dict, draw: random.Random, prefix: str = "") -> dict[str, Foun
             found |= spoiled(value, draw, f"{prefix}{key}.")
         elif draw.random() < 0.9:
             given = draw.choice(VALUES) if draw.random() < 0.25 else value
-            found[f"{prefix}{key}"] = Found(given, Place("x.py", 1), "it is unknown" if draw.random() < 0.02 else "")
+            found[f"{prefix}{key}"] = Found(given, "x.py:1", "it is unknown" if draw.random() < 0.02 else "")
     return found
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_any_values_at_all_become_a_task_that_loads(robot, seed):
     draw = random.Random(seed)
-    functions = [[draw.choice([None, [], [["pit_terrain", 0]], [["x_terrain", 1]]])] for _ in range(5)]
+    functions = [[draw.choice([None, ["", 0], ["pit_terrain", 0], ["x_terrain", 1]])] for _ in range(5)]
     fork = Fork("any", "", spoiled(DEFAULTS, draw), {}, [None, None], draw.choice([None, functions]))
     result = map_settings(fork)
     for known in (None, robot):
