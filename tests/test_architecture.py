@@ -101,6 +101,7 @@ def test_every_part_has_its_floor():
     assert sorted(part for parts in FLOORS for part in parts) == PARTS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS)
 def test_imports_point_one_way(part):
     above = [other for other in PARTS if other != part and floor_of(other) >= floor_of(part)]
@@ -109,6 +110,7 @@ def test_imports_point_one_way(part):
     assert not {name: modules for name, modules in found.items() if modules}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", WITHOUT)
 def test_a_part_does_without(part):
     files = [path for path in FILES if f"{name_of(path)}.".startswith(f"legged.{part}.")]
@@ -133,6 +135,7 @@ def test_rsl_rl_is_known_to_its_boundary_only():
     }
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_gpu_imports_no_gpu_engine():
     """The C engine must not cost the start-up of Warp, nor need it."""
     import subprocess

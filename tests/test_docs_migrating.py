@@ -103,6 +103,7 @@ def test_what_has_to_be_written_is_not_there(table):
     assert not names & LeggedRobot.terms("_reward_")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["last_air_time", "first_contact", "in_contact"])
 def test_contacts_have_what_the_page_says(name):
     assert f"`.{name}`" in PAGE

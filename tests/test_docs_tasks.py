@@ -90,6 +90,7 @@ SEVERAL = {task: [c for c in COMMANDS if task_of(c) == task] for task in dict.fr
 """Task -> the commands about it, in the order of the page: a policy is trained before it is played."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", SEVERAL)
 def test_every_command_of_the_page_runs(files, task, capsys):
     for command in SEVERAL[task]:
@@ -104,6 +105,7 @@ def test_every_file_of_the_page_is_used_by_a_command_of_it():
     assert not [name for name in MODULES if name not in used]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "method"),
     [

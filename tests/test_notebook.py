@@ -48,6 +48,7 @@ def test_outputs_are_stripped():
     assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (find_spec("nbclient") and find_spec("ipykernel")), reason="needs nbclient and ipykernel")
 @pytest.mark.parametrize("task", SMALL)
 def test_the_notebook_runs(task, tmp_path, monkeypatch):

@@ -227,6 +227,7 @@ def test_paths_in_the_text_are_there():
             assert (ROOT / path).exists() or of_gymnasium, f"{page.name}: {path}"
 
 
+@pytest.mark.slow
 def test_shipped_policy_follows_commands_in_c_mujoco(tmp_path, capsys):
     axes = ["--vx=-1:1:1", "--vy=-1:1:1", "--yaw=-1:1:1", "--robots", "1", "--physics", "mujoco"]
     assert grid.main([str(POLICY), "--out", str(tmp_path), *axes]) == 0
@@ -237,6 +238,7 @@ def test_shipped_policy_follows_commands_in_c_mujoco(tmp_path, capsys):
     assert result["falls"] == 0.0
 
 
+@pytest.mark.slow
 def test_shipped_policy_climbs_stairs_in_c_mujoco(tmp_path, monkeypatch):
     """Six robots of each step height; up to 0.15 m, all of them. 0.3 m is beyond what it can, so the test can tell."""
     monkeypatch.chdir(tmp_path)
@@ -258,6 +260,7 @@ def test_shipped_checkpoint_is_finite_and_of_its_task(policy):
     assert all(torch.isfinite(tensor).all() for tensor in saved["actor_state_dict"].values())
 
 
+@pytest.mark.slow
 def test_a_policy_without_its_optimiser_is_exported(tmp_path):
     """As the one for rough terrain is shipped."""
     assert "optimizer_state_dict" not in torch.load(ROUGH / "model.pt", weights_only=True, map_location="cpu")

@@ -79,6 +79,7 @@ class Reader(HTMLParser):
         self.text.append(data)
 
 
+@pytest.mark.slow
 @needs_mkdocs
 def test_nothing_is_fetched_from_elsewhere_and_all_links_lead_somewhere(site):
     pages = {path.resolve(): Reader(path) for path in site.rglob("*.html") if path.name != "404.html"}
@@ -132,6 +133,7 @@ def test_a_field_is_shown_with_default_unit_bounds_and_meaning(site):
     )
 
 
+@pytest.mark.slow
 @needs_mkdocs
 @pytest.mark.parametrize(
     ("page", "fine"), [("[here](page.md)", True), ("[away](nowhere.md)", False), ("[up](page.md#no)", False)]

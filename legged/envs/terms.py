@@ -148,7 +148,7 @@ class Terms:
 
     @unit("rad")
     def _obs_passive_pos(self) -> Tensor:
-        """Angles of the passive joints, less those of the default pose [rad]. For springs this is their deflection."""
+        """Angles of the passive joints, less those of the default pose; of a spring, its deflection [rad]."""
         return self.physics.qpos[:, self.passive_qpos_columns] - self.passive_default_pos
 
     @unit("rad/s")

@@ -1,6 +1,6 @@
 """Statistics of joints over time and over the gait cycle, of one policy or of two: tables, a page and a figure."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -73,8 +73,8 @@ def joint_statistics(episodes: Episodes) -> JointStatistics:
         raise ConfigError(f"POLICY: '{task}' has no joints with a motor each")
     names = [name for name, _ in MEASURED if name in episodes]
     settled = round(SETTLE_S / episodes.dt)
-    chosen = np.flatnonzero(episodes.lengths > settled)
-    if not len(chosen):
+    chosen = np.flatnonzero(episodes.lengths > settled).tolist()
+    if not chosen:
         raise ConfigError(f"POLICY: no episode of '{task}' is longer than {SETTLE_S:g} s")
     parts: list[dict[str, np.ndarray]] = []
     spans: list[tuple[int, int, dict[str, np.ndarray]]] = []
@@ -158,7 +158,7 @@ def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
     for name, title in _measured(found):
         heads = ["joint", *(f"{what}{of}" for of in names for what in ("mean", "standard deviation"))]
         columns = [values for one in several for values in (one.mean[name], one.std[name])]
-        cells: list[list[Cell]] = [list(one), *([_number(value) for value in column] for column in columns)]
+        cells: list[Sequence[Cell]] = [one, *([_number(value) for value in column] for column in columns)]
         if len(several) == 2:
             heads.append("difference of the means")
             cells.append([_number(value, "+.3f") for value in several[1].mean[name] - several[0].mean[name]])

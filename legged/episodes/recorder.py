@@ -323,10 +323,11 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
         strongest = task.control.nominal["torque_limit"].tolist()
     elif _all_motors(model):
         numbers = model.actuator_trnid[:, 0]
-        names, turning = [model.joint(j).name for j in numbers], model.jnt_type[numbers] == mujoco.mjtJoint.mjJNT_HINGE
+        names = tuple(model.joint(j).name for j in numbers)
+        turning = (model.jnt_type[numbers] == mujoco.mjtJoint.mjJNT_HINGE).tolist()
         positions, velocities = model.jnt_qposadr[numbers], model.jnt_dofadr[numbers]
         limited = model.jnt_limited[numbers, None].astype(bool)
-        ranges, fastest = np.where(limited, model.jnt_range[numbers], np.inf), [np.inf] * model.nu
+        ranges, fastest = np.where(limited, model.jnt_range[numbers], np.inf), np.full(model.nu, np.inf)
         strongest = np.abs(_control_ranges(model)).max(axis=0) * np.abs(_torque_per_control(model))
     else:
         return []

@@ -81,7 +81,7 @@ def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.Mj
     look.global_.offwidth, look.global_.offheight, look.global_.fovy = WIDTH, height, FIELD_OF_VIEW
     look.quality.shadowsize, look.quality.offsamples = 8192, 8
     look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = [0.42] * 3, [0.12] * 3, [0.0] * 3
-    extent = float(np.hypot(*(0.5 * side for side in terrain.height_map.size)))
+    extent = 0.5 * float(np.hypot(*terrain.height_map.size))
     scene.stat.extent, scene.stat.center = extent, [0, 0, 0]
     look.map.znear, look.map.zfar, look.map.shadowclip = 0.2, 6.0, 1.2
     scene.worldbody.add_light(

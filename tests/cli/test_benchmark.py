@@ -100,6 +100,7 @@ def test_a_policy_of_another_robot_is_refused(capsys):
     assert "go2" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])
 def test_iterations_are_counted_without_the_first(kind):
     task = small_task(num_envs=4)
@@ -142,6 +143,7 @@ def test_grounds_need_mujoco_warp_and_terrain(arguments, words, capsys):
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd, monkeypatch):
     """The first size wants 4 PB, which no process can have; the next is none the worse for it."""
     too_many = 1_000_000
@@ -174,6 +176,7 @@ def test_sizes_are_compared_in_processes_of_their_own(tmp_path, capfd, monkeypat
     assert not list(tmp_path.glob("logs*"))
 
 
+@pytest.mark.slow
 def test_sizes_of_a_task_that_is_a_file(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(registry, "_REGISTERED", {})  # another test's file may be called so
     (tmp_path / "mine.yaml").write_text("extends: anymal_c_flat\n")
@@ -197,6 +200,7 @@ def broken_task(folder, statement: str) -> list[str]:
     return ["broken", "--import", "broken.py", "--sim-device", "cpu", "--robots", "4,5"]
 
 
+@pytest.mark.slow
 def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert scale.main(broken_task(tmp_path, "os._exit(3)")) == 1
@@ -204,6 +208,7 @@ def test_a_size_that_fails_otherwise_is_told_too(tmp_path, capfd, monkeypatch):
     assert [row.split() for row in rows] == [[size, "exit", "code", "3"] for size in ("4", "5")]
 
 
+@pytest.mark.slow
 def test_a_mistake_that_is_the_same_for_all_sizes_is_told_once(tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert scale.main(broken_task(tmp_path, "raise ValueError('no such thing')")) == 2
@@ -268,6 +273,7 @@ def test_the_engine_of_a_scale_is_the_one_asked_for(capsys, monkeypatch):
     assert command[1:6] == ["-m", "legged", "benchmark", "step", "anymal_c_flat"]
 
 
+@pytest.mark.slow
 def test_a_start_is_timed_beside_importing_torch(capsys):
     assert startup.main(["--repeats", "1", "--out", "times", "anymal_c_flat", *SMALL]) == 0
     times = json.loads(Path("times/benchmark.json").read_text())

@@ -12,6 +12,7 @@ from legged.cli.evaluate import onnx, policy
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
+@pytest.mark.slow
 def test_an_exported_folder_is_measured_as_by_its_own_command(capsys):
     flags = ["--no-video", "--headless", "--num-envs", "1", "--sim-device", "cpu", "--out", "."]
     assert call(play.main, [str(POLICY), *flags]) == 0

@@ -35,6 +35,7 @@ def test_the_motor_that_was_simulated_is_found_within_5_percent(tmp_path):
     assert found == pytest.approx(TRUTH, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_peak_of_the_friction_that_the_log_does_not_show_is_not_invented(tmp_path, capsys):
     """Dry friction alike at all speeds once came out as 4.4 N m below 0.005 rad/s, or as none beyond 5 rad/s."""
     np.savez(tmp_path / "log.npz", **simulated_log(12.0, noise=1.0, breakaway=TRUTH["coulomb"]))
@@ -146,6 +147,7 @@ def test_a_log_is_resampled_without_looking_ahead(tmp_path):
         log.resampled(0.001)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
 def test_the_command_writes_what_a_task_reads(tmp_path, kind, capsys):
     np.savez(tmp_path / "log.npz", **simulated_log(6.0))
@@ -170,6 +172,7 @@ def test_the_command_writes_what_a_task_reads(tmp_path, kind, capsys):
     assert torch.isfinite(task.torques).all()
 
 
+@pytest.mark.slow
 def test_a_network_in_a_task_gives_what_the_fit_says_of_it(tmp_path):
     """The torques of a task, step by step, are those of the same network as plain torch runs it on the whole history."""
     np.savez(tmp_path / "log.npz", **simulated_log(6.0))
@@ -234,6 +237,7 @@ def test_an_lstm_in_a_task_is_torchs():
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

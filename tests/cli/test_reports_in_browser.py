@@ -76,6 +76,7 @@ def open_page(browser, logs):
 PAGES = (f"{TASK}/*_first/report.html", "experiments.html", "comparison.html")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize("width", [WIDE, NARROW])
 def test_a_page_is_whole_on_any_screen(name, width, open_page):

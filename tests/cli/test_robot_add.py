@@ -23,6 +23,7 @@ from legged.robots.robot import load_robot
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
+@pytest.mark.slow
 def test_a_urdf_becomes_a_robot_whose_task_steps(added):
     out = added(urdf(), "--name", "first_toy")
     assert "first_toy: a quadruped of 13 kg, 12 hinges, 12 motors, 13 shapes" in out
@@ -76,6 +77,7 @@ def test_the_box_of_its_inertia_stands_for_a_trunk_without_a_shape(added):
     np.testing.assert_allclose(np.abs(turned.reshape(3, 3)) @ box.size, [0.3, 0.2, 0.1], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_frame_on_the_ground_is_not_the_base(added):
     """0.3 m below it, the base would stand at a tenth of its height, and torque limits by its height be a tenth too."""
     weak = urdf().replace('effort="30"', 'effort="0"')
@@ -157,6 +159,7 @@ def test_legs_that_nothing_touches_get_feet(added):
     np.testing.assert_allclose(model.geom("fl_foot").pos, [0, 0, -0.12], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_path):
     """Half lengths 0.02, 0.01 and 0.11 m down to -0.21; the foot's middle is at -0.2, so the end goes to -0.2 + 0.02."""
     corners = [f"v {x} {y} {z}" for x in (-0.02, 0.02) for y in (-0.01, 0.01) for z in (-0.11, 0.11)]

@@ -98,6 +98,7 @@ SPIDER = """<mujoco><worldbody><body name="core"><freejoint/><geom type="cylinde
 <geom name="foot" size="0.01" pos="0.15 0 0" mass="0.01"/></body></body></body></replicate></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("legs", ["spider of 3", "spider of 6", "short behind"])
 def test_all_feet_stand_on_the_same_ground(added, legs):
     """Legs drawn stretched to all sides, and hind shanks of 0.15 m: the base is level, as high as the shortest leg allows.

@@ -29,7 +29,7 @@ from legged.learning.captured import CapturedRunner
 from legged.learning.invocation import INVOCATION_FILE
 from legged.learning.timing import TIMING_FILE
 
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 REPORTED = ["train.runner.report=true", "train.runner.film=false", "env.episode_length_s=0.1"]
 FLAGS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]

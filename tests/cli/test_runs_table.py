@@ -50,6 +50,7 @@ def table_in(name: str = "logs/experiments.md") -> list[dict[str, str]]:
     return [dict(zip((text.replace("\\", "") for text in head), row, strict=True)) for row in found]
 
 
+@pytest.mark.slow
 def test_runs_are_in_one_table_newest_first(capsys):
     folders = [write_run(stamp) for stamp in STAMPS]
     (folders[0] / "note.txt").write_text("first steps")
@@ -86,6 +87,7 @@ def test_runs_are_in_one_table_newest_first(capsys):
     assert "return, evaluated" not in one  # of no run
 
 
+@pytest.mark.slow
 def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys):
     """As after evaluate --checkpoint best, or of a training that went on afterwards."""
     last = f"model_{POLICY_ITERATION}.pt"
@@ -128,6 +130,7 @@ def test_a_folder_of_several_and_one_inside_it_name_a_run_once():
     assert len(table_in("pages/experiments.md")) == 2
 
 
+@pytest.mark.slow
 def test_seeds_of_a_training_share_a_row():
     """RMSE of 0.04 and 0.07 m/s; the third seed learned with another reward, the fourth run has a note."""
     for stamp, seed, error in zip(STAMPS, (2, 1, 3), (0.04, 0.07, 0.5), strict=True):
@@ -176,6 +179,7 @@ def test_labels_leave_out_what_all_have():
     assert apart(["go2, seed 1", "go2, wide, seed 1"]) == ("", ["go2, seed 1", "go2, wide, seed 1"])
 
 
+@pytest.mark.slow
 def test_real_runs_are_compared():
     a = tiny_run("train.runner.run_name=a", "env.episode_length_s=0.1", iterations=2)
     b = tiny_run("train.runner.run_name=b", "env.episode_length_s=0.1", "rewards.scales.torques=-3e-4", iterations=3)

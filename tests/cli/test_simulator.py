@@ -97,6 +97,7 @@ def test_it_stands_in_its_default_pose_and_lies_without_torque(simulated):
     assert not simulated.report()["fell"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anymal_c", "anymal_c_flat"])
 def test_its_sensors_and_sources_measure_what_the_tasks_do(name):
     """Put where a robot of the task is, on the same ground: the same numbers to the last digits of float32."""
@@ -253,6 +254,7 @@ STAIRS = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="a robot and its program need a core each")
 def test_the_program_walks_up_stairs_in_another_process(tmp_path):
     """The shipped policy that needs no more than a robot measures: 50 Hz, of which cycles none was late, 1 % of packets lost,

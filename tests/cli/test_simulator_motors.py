@@ -170,6 +170,7 @@ def test_the_command_gives_the_robot_what_the_contract_says(contract):
     assert simulated_robot.scan_of(SimpleNamespace(sources={"heights": term})) == "highest"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "says"),
     [

@@ -257,6 +257,7 @@ def test_a_target_that_is_not_reached_gives_no_value():
 # ---- sweeps ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
     written(seeds=[1, 2])
     assert call(sweep.main, [*FLAGS, "--trials", "4"]) == 0
@@ -309,6 +310,7 @@ def test_a_trial_that_falls_behind_is_ended_and_keeps_its_run(monkeypatch):
     assert read_note(Path(run)) == f"trial 0 of sweep_mine: {words}; {PRUNED} (after 1 iterations)"
 
 
+@pytest.mark.slow
 def test_settings_that_do_not_fit_each_other_have_no_value_and_end_nothing_else():
     """More mini-batches than samples, 16: each choice is right with the samples of another configuration."""
     parameters = {
@@ -325,6 +327,7 @@ def test_settings_that_do_not_fit_each_other_have_no_value_and_end_nothing_else(
     assert sum(trial.state.name == "COMPLETE" for trial in trials) >= 1
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_and_loses_nothing():
     """Killed in its second trial at the latest: what was found stays, what was begun is made again with its settings."""
     changes = {"pruner": "none", "trials": 4}
@@ -354,6 +357,7 @@ def test_a_killed_sweep_goes_on_and_loses_nothing():
     assert len(set(drawn)) == 4
 
 
+@pytest.mark.slow
 def test_processes_share_a_sweep(capsys):
     written(trials=4, pruner="none")
     assert call(sweep.main, [*FLAGS, "--jobs", "2"]) == 0
@@ -365,6 +369,7 @@ def test_processes_share_a_sweep(capsys):
     assert [f"[{i} of 4]" in out for out in [capsys.readouterr().out] for i in range(1, 5)] == [True] * 4
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_trial_with_a_checkpoint_and_it_is_tried_again():
     overrides = {**FILE["overrides"], "train.runner": {**FILE["overrides"]["train.runner"], "max_iterations": 100_000}}
     written(overrides=overrides)

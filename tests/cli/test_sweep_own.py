@@ -51,6 +51,7 @@ def test_of_processes_that_begin_at_once_one_makes_the_trial_of_the_own_settings
     assert beside.plan.settings(second.params) != plan.own
 
 
+@pytest.mark.slow
 def test_what_is_found_stands_beside_the_own_settings(capsys):
     plan = plan_of(AMONG)
     assert call(sweep.main, FLAGS) == 0
@@ -63,6 +64,7 @@ def test_what_is_found_stands_beside_the_own_settings(capsys):
     assert "Trial 0 has the task's own settings." in (plan.folder / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_own_settings_that_are_not_among_those_tried_are_told(capsys):
     plan = plan_of(
         {

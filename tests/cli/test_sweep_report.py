@@ -64,6 +64,7 @@ def test_the_command_of_the_best_trial_sets_what_it_was_trained_with():
     assert "train.policy.activation=relu" in command
 
 
+@pytest.mark.slow
 def test_nothing_is_said_to_matter_where_all_trials_are_alike():
     """As when each reaches its target at the first evaluation: optuna warns, and calls all settings alike important."""
     values = {
@@ -95,6 +96,7 @@ def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_report
     assert call(reporting.main, ["mine.yaml"]) == 0
 
 
+@pytest.mark.slow
 def test_a_task_may_be_a_file_beside_that_of_the_sweep():
     """As it may of `legged train`, whose command in the table names it, as one would from where the sweep was run."""
     runner = {"max_iterations": 2, "num_steps_per_env": 4, "evaluate_interval": 1, "evaluate_envs": 2}

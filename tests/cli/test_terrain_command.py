@@ -33,6 +33,7 @@ def red(picture: np.ndarray) -> np.ndarray:
     return (r > 90) & (r > 3 * g) & (r > 3 * b)
 
 
+@pytest.mark.slow
 def test_chosen_types_side_by_side(tmp_path, can_render):
     """A pit on the left, a pyramid on the right: in the map blue and red, in the picture a robot on either."""
     chart, picture = shown(tmp_path / "new" / "folder", "--types", "stairs_up,stairs_down", "--difficulty", "0.9")
@@ -46,6 +47,7 @@ def test_chosen_types_side_by_side(tmp_path, can_render):
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
 
 
+@pytest.mark.slow
 def test_the_grid_of_a_task(tmp_path, can_render):
     grid = ["terrain.mesh_type=height_map", "terrain.num_cols=2", "terrain.num_rows=3", "terrain.max_init_terrain_level=1"]
     chart, picture = shown(tmp_path, *grid, "terrain.proportions={rough_slope_up: 0.5, obstacles: 0.5}")

@@ -94,6 +94,7 @@ def test_addresses():
     ]
 
 
+@pytest.mark.slow
 def test_train_and_play_name_the_command(capsys):
     flags = ["--task", TASK, "--sim_device", "cpu", "sim.physics=mujoco", "sim.threads=1"]
     assert call(train.main, [*flags, "--num_envs", "4", "--max_iterations", "1", *TINY_TRAINING]) == 0

@@ -83,6 +83,7 @@ def test_help_and_lists_import_nothing_heavy(words):
     assert done.stdout
 
 
+@pytest.mark.slow
 def test_python_m_legged_is_the_installed_command(tmp_path):
     """The script that an installation makes calls `main` without arguments."""
     script = tmp_path / "bin" / "legged"

@@ -162,6 +162,7 @@ def test_a_fault_of_the_program_keeps_its_traceback():
 # ---- training --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_training_whose_output_goes_away_stops_with_a_checkpoint(monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdout", Failing(300, BrokenPipeError(errno.EPIPE, "Broken pipe")))
     assert train.main([*ARGUMENTS, "--max_iterations", "100000", "train.runner.save_interval=100000"]) == 1
@@ -170,6 +171,7 @@ def test_a_training_whose_output_goes_away_stops_with_a_checkpoint(monkeypatch, 
     assert checkpoints(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
 def test_a_full_disk_behind_the_output_leaves_no_traceback_at_exit():
     with open("/dev/full", "w") as full:

@@ -82,6 +82,7 @@ def running(*command: str):
 TRAIN = [str(REPOSITORY / "train.py"), "--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "100000"]
 
 
+@pytest.mark.slow
 def test_a_terminal_that_is_closed_stops_a_training_with_a_checkpoint():
     with running(*TRAIN, *TINY_TRAINING) as process:
         wait_for(lambda: "\nit 1/" in Path("out.txt").read_text(), process)
@@ -92,6 +93,7 @@ def test_a_terminal_that_is_closed_stops_a_training_with_a_checkpoint():
     assert f"stopped after {done + 1} iterations" in Path("out.txt").read_text()
 
 
+@pytest.mark.slow
 def test_a_second_signal_ends_a_training_at_once_in_one_line():
     slow = ["train.runner.num_steps_per_env=100000"]
     with running(*TRAIN, *TINY_TRAINING, *slow) as process:
@@ -104,6 +106,7 @@ def test_a_second_signal_ends_a_training_at_once_in_one_line():
     assert not Path("logs").exists()  # there was no checkpoint to keep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["legged.cli.play"], ["legged", "evaluate"]])
 def test_an_interrupt_during_imports_is_one_line(command):
     with running("-X", "importtime", "-m", *command, TASK) as process:  # says on stderr what is imported

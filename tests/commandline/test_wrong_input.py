@@ -271,6 +271,7 @@ FOREIGN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("main", "flag"), LOADING)
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_a_file_that_is_no_checkpoint(fails, run, main, flag, kind):
@@ -333,6 +334,7 @@ def test_a_file_where_the_log_folder_should_be(fails, tmp_path):
     assert (tmp_path / "logs").read_text() == "mine\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spec", ["a:b:c", "1:0:0.1", "0:1", "0:1:0", "0:1:-1", "", "0:1:2:3", "nan", "0:inf:1", "0:1:nan"])
 def test_a_grid_that_is_none(fails, run, spec):
     fails(grid.main, task(f"--vx={spec}"), "--vx", f"'{spec}'", "low:high:step")

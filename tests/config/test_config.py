@@ -312,6 +312,7 @@ def test_a_missing_file_is_refused_by_name(tmp_path):
 # ---- written and read back -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 @pytest.mark.parametrize("on_cpu", [False, True])
 def test_every_shipped_task_loads_names_what_exists_and_survives_a_round_trip(path, on_cpu, tmp_path):

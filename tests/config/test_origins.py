@@ -75,6 +75,7 @@ def test_a_configuration_knows_its_origins_but_they_are_no_setting(mine):
 # ---- mistakes that are found with the whole configuration -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -292,6 +292,7 @@ def reading_of(task, robot, sources):
     return Reading(0.0, 0.0, qpos[3:7], qvel[3:6], qpos[7:], qvel[6:], sources={name: given[name] for name in sources})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

@@ -109,6 +109,7 @@ def own_run(workplace, monkeypatch, capsys):
     return folder
 
 
+@pytest.mark.slow
 def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch, capsys):
     """Its task is its YAML file; an export in its run folder has the robot that the run's configuration names; where it was
     moved away from there, and where a run is named whose task nobody knows, an error says what to name.
@@ -134,6 +135,7 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
     assert simulated[-1] == str(robot)
 
 
+@pytest.mark.slow
 def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys):
     """Its export was once taken for its newest policy, whatever had been learned since. Who names the export gets it."""
     folder = tiny_run(iterations=1)

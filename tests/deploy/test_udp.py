@@ -248,6 +248,7 @@ def test_a_command_says_what_was_written(link):
     np.testing.assert_allclose(unpack_command(body)[1].mean(axis=1), [0.5, 90.0, 4.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["SIGHUP", "SIGTSTP"])
 def test_a_program_that_is_asked_to_end_brakes_the_robot_for_a_second_and_says_goodbye(name, policy_folder, tmp_path):
     """The command as a process, whose terminal is closed, or in which somebody types Ctrl-Z."""

@@ -105,6 +105,7 @@ def by_onnx(folder, observations):
     return np.array(actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_the_header_computes_what_the_onnx_file_does(variant, program, tmp_path):
     """100 random observations, to 1e-5 of the largest action, or 1e-5 where that is below 1."""

@@ -59,6 +59,7 @@ class KeepsABuffer(LeggedRobot):
         return self.smooth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("graph", [True, False])
 @pytest.mark.parametrize("first", ["inference", "plain", "in place"])
 def test_steps_in_and_outside_inference_mode_follow_each_other(graph, first):

@@ -139,6 +139,7 @@ class EndsAsWell(LeggedRobot):
         super().check_termination()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Ends, Measures, Rewards])
 def test_a_rollout_is_the_same_whether_or_not_terms_run_early(kind):
     """An override of a hook may change what terms read, so all of them run after it."""

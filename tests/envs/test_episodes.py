@@ -37,6 +37,7 @@ def pitched(degrees: float) -> list[float]:
 # ---- time ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_episode_times_out_after_exactly_its_length_and_is_no_failure():
     task = standing(("env.episode_length_s", 0.6))
     assert task.max_episode_length == 30
@@ -100,6 +101,7 @@ def test_a_base_that_touches_the_ground_ends_the_episode_of_that_robot_only():
     assert task.episode_length_buf.tolist() == [1, 1, 0, 1]
 
 
+@pytest.mark.slow
 def test_standing_on_the_feet_ends_nothing():
     task = standing()
     for _ in range(100):
@@ -109,6 +111,7 @@ def test_standing_on_the_feet_ends_nothing():
     assert (task.base_pos[:, 2] > 0.4).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("limit", "ends"), [(0.0, False), (0.55, False), (0.65, True)])
 def test_a_lowest_base_height_can_be_set(limit, ends):
     task = standing(("terminations.min_base_height", limit))
@@ -118,6 +121,7 @@ def test_a_lowest_base_height_can_be_set(limit, ends):
     assert task.terminated_buf.tolist() == dones.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limit", "ends"), [(0.0, [False] * 4), (0.6, [False, False, True, True]), (2.0, [False] * 3 + [True])]
 )
@@ -140,6 +144,7 @@ def test_termination_costs_what_its_scale_says_even_where_rewards_are_clipped_at
 # ---- worlds that blow up ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["qpos_base", "qpos_joint", "qvel", "inf"])
 def test_a_world_that_blows_up_is_terminated_counted_reset_and_finite_at_once(where):
     length = ("train.runner.num_steps_per_env", 10)
@@ -194,6 +199,7 @@ def test_a_world_that_blows_up_does_not_stop_the_command_curriculum_or_poison_it
 # ---- resets ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_reset_draws_joints_and_velocities_from_their_ranges():
     task = small_task(num_envs=500)
     task.reset()
@@ -244,6 +250,7 @@ def test_a_reset_in_the_middle_leaves_the_others_alone_and_gives_a_new_command()
     assert (task.contacts.last_air_time[:3] > 0.0).all()
 
 
+@pytest.mark.slow
 def test_an_episode_does_not_depend_on_what_was_before_it():
     """Neither on the task's memory nor on the engine's, whose solver starts from the last solution."""
     whole_ranges = ("commands.curriculum.enabled", False)  # a curriculum is to remember

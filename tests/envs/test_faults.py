@@ -65,6 +65,7 @@ def logged(task: LeggedRobot) -> dict[str, float]:
 # ---- the task --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", BAD)
 @pytest.mark.parametrize("kind", ["reward", "obs"])
 def test_a_bad_number_of_one_robot_is_counted_and_resets_that_robot_only(kind, value):
@@ -258,6 +259,7 @@ def train_broken(*arguments: str, iterations: int = 3) -> int:
 LOOPS = ["captured", "stock"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize("kind", ["reward", "obs"])
 def test_training_survives_one_bad_robot_and_names_the_term(capsys, kind, loop):
@@ -276,6 +278,7 @@ def test_training_survives_one_bad_robot_and_names_the_term(capsys, kind, loop):
         assert all(value == value for value in values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize("kind", ["reward", "obs"])
 def test_training_that_goes_on_being_bad_ends_at_the_last_checkpoint(capsys, kind, loop):

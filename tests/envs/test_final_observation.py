@@ -8,6 +8,7 @@ from legged.envs.final_observation import keep_final_step
 from legged.registry import make_task, task_config
 
 
+@pytest.mark.slow
 def test_it_is_kept_only_where_somebody_asks():
     task = small_task()
     assert task.step_watcher is None
@@ -16,6 +17,7 @@ def test_it_is_kept_only_where_somebody_asks():
     assert set(kept.observations) == set(task.observation_groups)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("history", [1, 3])
 def test_rollouts_are_bit_for_bit_those_of_a_task_that_keeps_nothing(history):
     settings = ("observations.groups.actor.history", history), ("observations.add_noise", True), ("env.episode_length_s", 0.2)

@@ -267,6 +267,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUSED)
 def test_the_guard_names_the_reward_and_says_why(name):
     function, words = REFUSED[name]

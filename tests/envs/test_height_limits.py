@@ -1,5 +1,6 @@
 """How much of the ground's height is observed, in training and once a policy is trained."""
 
+import pytest
 import torch
 from helpers import CALM, ENGINE
 
@@ -21,6 +22,7 @@ def config(*changes):
     return task_config("anymal_c", [("env.num_envs", 2), *ENGINE, *CALM, *GROUND, *changes], on_cpu=True)
 
 
+@pytest.mark.slow
 def test_low_ground_looks_no_deeper_than_the_limit_of_depth():
     """Worked by hand: the base is 1 m high, so that 0.5 m is level; higher by 0.4 m is cut at 0.3, lower by 0.4 m at 0.1."""
     limits = [("observations.heights_limit", 0.3), ("observations.depth_limit", 0.1)]

@@ -56,6 +56,7 @@ def test_who_is_too_low_or_too_high_has_failed():
     assert not extras["time_outs"].any()
 
 
+@pytest.mark.slow
 def test_episodes_begin_near_the_model_s_own_state():
     task = make(3000)
     for found, around in ((task.physics.qpos, task.qpos0), (task.physics.qvel, 0.0)):

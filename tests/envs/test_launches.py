@@ -18,12 +18,14 @@ def launches_of(name, settings=()):
     return launches
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("anymal_c_flat", 120), ("anymal_c", 157)])
 def test_a_step_is_few_launches(name, most):
     launches = launches_of(name)
     assert launches.total() <= most, launches
 
 
+@pytest.mark.slow
 def test_motors_and_sensors_with_all_their_errors_are_few_launches_more():
     """Whatever the number of terms and joints: at most 22, where the step of `anymal_c` is 157."""
     errors = [

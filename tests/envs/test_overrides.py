@@ -83,6 +83,7 @@ def hook(self, *args) -> None:
     """Something of a fork."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*LEGGED_GYM, *FORKS, *ISAAC_LAB])
 def test_a_hook_that_nobody_calls_is_refused_by_class_file_and_line(name):
     line = hook.__code__.co_firstlineno

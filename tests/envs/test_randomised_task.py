@@ -84,6 +84,7 @@ def test_gains_are_factors_on_those_of_the_law():
     torch.testing.assert_close(torques, (0.15 * plain.stiffness - plain.damping).view(1, -1))
 
 
+@pytest.mark.slow
 def test_a_zero_offset_of_0_05_rad_shifts_the_held_pose():
     """Encoders show 0.05 rad too much: motors come to rest 0.05 rad lower, and observations see nothing of it."""
     settings = [("init_state.dof_pos_factor", [1.0, 1.0]), ("init_state.base_velocity", [0.0, 0.0])]
@@ -138,6 +139,7 @@ def test_a_kick_adds_to_the_velocity_and_comes_at_its_time():
     assert kicks.time_left.max() <= 0.1 + 1e-6
 
 
+@pytest.mark.slow
 def test_a_force_acts_for_its_duration_and_accelerates_by_f_over_m():
     """52.13 N on the base of 52.13 kg, in a fall: 1 m/s^2 of the whole robot, for 3 control steps of 0.02 s."""
     task = small_task(num_envs=1)
@@ -199,6 +201,7 @@ def test_only_robots_that_are_reset_draw_again_and_the_start_is_kept():
     assert ((task.physics.batch.expand("body_mass") != masses).any(axis=1)).tolist() == mask.tolist()
 
 
+@pytest.mark.slow
 def test_what_is_drawn_is_what_the_engine_has():
     """After resets, of fields from which constants are derived and of others; and the constants fit the masses."""
     task = after(small_task(*ALL, ("env.episode_length_s", 0.1)), 12)
@@ -234,6 +237,7 @@ def test_intervals_draw_each_robot_at_its_own_moments():
     torch.testing.assert_close(found, task.randomization.fields["gravity_x"])
 
 
+@pytest.mark.slow
 def test_a_range_grows_with_iterations_and_checkpoints_know_how_far():
     draw = {"range": [0.5, 1.5], "when": "reset", "grow": [0, 2]}
     settings = with_ranges(p_gain=draw), ("train.runner.num_steps_per_env", 10), ("env.episode_length_s", 0.02)
@@ -251,6 +255,7 @@ def test_a_range_grows_with_iterations_and_checkpoints_know_how_far():
     assert 0.2 < (other.randomization.fields["p_gain"] - 1.0).abs().max() <= 0.25 + 0.03
 
 
+@pytest.mark.slow
 def test_a_state_that_is_put_back_gives_the_same_steps():
     torch.manual_seed(3)
     task = after(small_task(*ALL, ("env.episode_length_s", 0.1)), 7)
@@ -286,6 +291,7 @@ def in_c():
     return run("mujoco")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco_warp", "newton"])
 def test_all_engines_make_the_same_of_everything(in_c, engine):
     """35 control steps in the air and on the ground, with resets in between; the fused step takes all of it, and Newton's
@@ -301,6 +307,7 @@ def test_all_engines_make_the_same_of_everything(in_c, engine):
     torch.testing.assert_close(other.base_pos, in_c.base_pos, atol=2e-5, rtol=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp", "newton", on_gpu("mujoco_warp, cuda"), on_gpu("newton, cuda")])
 def test_a_step_in_which_everything_is_drawn_can_be_captured(engine):
     name, _, gpu = engine.partition(", ")
@@ -314,6 +321,7 @@ def test_a_step_in_which_everything_is_drawn_can_be_captured(engine):
         assert task.captured
 
 
+@pytest.mark.slow
 def test_everything_adds_few_launches():
     """A third of them beside the step; and what is not asked for adds none (test_launches.py)."""
     counts = []

@@ -241,6 +241,7 @@ def trajectory(seed: int, **settings) -> list[torch.Tensor]:
     return found
 
 
+@pytest.mark.slow
 def test_a_seed_fixes_the_whole_trajectory_whatever_the_number_of_threads():
     first, other = trajectory(3), trajectory(4)
     for again in (trajectory(3), trajectory(3, **{"sim.threads": 2})):

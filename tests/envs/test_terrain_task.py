@@ -172,6 +172,7 @@ def test_a_robot_that_walks_off_the_map_is_reset_and_not_blamed(task):
     assert (task.base_pos[2:4] - task.env_origins[2:4])[:, :2].abs().max() <= 1.01
 
 
+@pytest.mark.slow
 def test_lowest_base_height_counts_from_the_ground():
     """At the bottom of stairs of 0.2 m risers, a base 0.6 m above its ground is far below zero and still alright."""
     task = terrain_task("anymal_c", ("terminations.min_base_height", 0.3), ("terrain.max_init_terrain_level", 3))
@@ -239,6 +240,7 @@ def test_always_promoted_robots_have_a_mean_level_of_six():
     assert torch.stack(means).mean() == pytest.approx(6.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_levels_are_saved_and_restored(task):
     state = task.progress()
     state["terrain_curriculum"]["levels"] = torch.tensor([3, 2, 1, 0, 3, 2, 1, 0])
@@ -287,6 +289,7 @@ def test_levels_are_displayed():
 # ---- what the networks see -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "actor"), [("anymal_c", 235), ("anymal_c_blind", 48), ("anymal_c_proprio", 6 * 45)])
 def test_the_critic_sees_heights_whatever_the_actor_does(name, actor):
     observations = terrain_task(name).get_observations()
@@ -364,6 +367,7 @@ def test_a_wrong_terrain_is_refused_before_anything_is_built(changes, message):
         config("anymal_c", *changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anymal_c", "anymal_c_proprio"])
 def test_a_training_on_terrain_runs_and_resumes(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

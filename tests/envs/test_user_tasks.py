@@ -89,6 +89,7 @@ def test_a_yaml_file_trains_and_its_run_lies_under_its_name():
     assert from_dict(read_yaml(folder / "config.yaml")).robot == str(Path("robots/spotty").resolve())
 
 
+@pytest.mark.slow
 def test_a_policy_of_a_yaml_file_is_played_and_judged(capsys):
     written("mine.yaml", f"extends: {TASK}\n")
     tiny_run("--task", "mine.yaml")
@@ -97,6 +98,7 @@ def test_a_policy_of_a_yaml_file_is_played_and_judged(capsys):
     assert "logs/mine/" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_command_that_names_no_task_is_told_of_a_yaml_file_by_import(show, error, capsys):
     """As is one that names only the run of such a task."""
     written("mine.yaml", f"extends: {TASK}\nenv: {{num_envs: 7, episode_length_s: 0.4}}\n")

@@ -88,6 +88,7 @@ def replace_array(name: str, array: np.ndarray):
     return apply
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "words"),
     [

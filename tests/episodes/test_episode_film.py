@@ -29,6 +29,7 @@ FEW_TILES = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "wish",
     [
@@ -57,6 +58,7 @@ def test_the_ground_below_a_robot_is_that_of_the_recording(wish):
     assert np.abs(grounds).max() > 0.05  # it is not the level around the tiles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.7, 0.35])  # of what they take when they are fine; stairs in full view need the second
 def test_pictures_are_so_coarse_that_they_fit(share, monkeypatch):
     """Noise does not compress: it gets the lowest quality but one that is small enough."""

@@ -92,6 +92,7 @@ def settled(page, frame: int) -> dict:
     return page.evaluate("episode.state()")
 
 
+@pytest.mark.slow
 def test_hovering_over_a_plot_moves_the_picture_and_all_plots(opened):
     page = opened(film_of_greys())
     plot = page.locator(".plot").first.bounding_box()

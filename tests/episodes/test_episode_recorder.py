@@ -16,6 +16,8 @@ from legged.policies.restore import policy_of
 from legged.registry import make_task, register, task_config
 from legged.terrain import TERRAIN_TYPES
 
+pytestmark = pytest.mark.slow
+
 LENGTHS = (3, 7, 11, 40)
 
 

@@ -18,6 +18,7 @@ FEW = ["--physics", "mujoco", "--episodes", "3", "--num-envs", "2", "sim.threads
 HERE = [str(POLICY), *FEW, "env.episode_length_s=1.2"]
 
 
+@pytest.mark.slow
 def test_a_policy_is_recorded_listed_and_summed_up(capsys):
     assert call(record.main, [*HERE, "--out", "out", "--sort", "energy"]) == 0
     out = capsys.readouterr().out
@@ -45,6 +46,7 @@ def test_a_policy_is_recorded_listed_and_summed_up(capsys):
     assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page), "it fetches nothing"
 
 
+@pytest.mark.slow
 def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monkeypatch):
     run = tiny_run("env.episode_length_s=0.4")
     capsys.readouterr()
@@ -59,6 +61,7 @@ def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monk
     assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_page_says_what_was_changed_for_its_episodes(capsys):
     tiny_run("env.episode_length_s=0.1")
     asked = ["observations.add_noise=true", "domain_rand.push_robots=true"]
@@ -69,6 +72,7 @@ def test_a_page_says_what_was_changed_for_its_episodes(capsys):
     assert said in Path("out/episode_000.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsys):
     def fail(*_):
         raise RunError("cannot render here")
@@ -128,6 +132,7 @@ def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
     )
 
 
+@pytest.mark.slow
 def test_two_policies_are_compared(capsys):
     changes = ["env.episode_length_s=1.2", *FEW]
     assert call(record.main, [*HERE, "--out", "out"]) == 0

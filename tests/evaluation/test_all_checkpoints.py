@@ -17,6 +17,7 @@ HERE = [TASK, "--sim-device", "cpu", "--robots", "1", "sim.threads=1"]
 AXIS = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 
+@pytest.mark.slow
 def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys):
     """Networks of zeros stand still whatever they are asked for, so their error is sqrt(vx^2 + vy^2), averaged over the
     grid's 25 pairs, and the limit decides who walks.
@@ -48,6 +49,7 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
     assert f"after {wanted:.1f} s" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_file_says_under_what_conditions_checkpoints_were_judged_and_lost_contacts_are_warned_of(capsys, monkeypatch):
     tiny_run(iterations=1)
     (folder,) = run_folders()

@@ -43,6 +43,7 @@ def test_all_engines_there_are_take_part():
     assert names == list(following.ENGINES) == ENGINES
 
 
+@pytest.mark.slow
 def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, capsys, monkeypatch):
     chosen = {name: following.ENGINES[name] for name in ("mujoco", "newton_mujoco")}
     monkeypatch.setattr(following, "ENGINES", chosen)

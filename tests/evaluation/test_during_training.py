@@ -88,6 +88,7 @@ def test_who_has_fallen_counts_as_standing_still():
     assert found["ang_vel_rmse"] == pytest.approx(abs(cells[:, 2]).mean(), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_policy_is_worth_the_same_again_and_nothing_random_is_drawn():
     training = small_task(*BRIEF, num_envs=2)
     before = generators()
@@ -104,6 +105,7 @@ def test_the_same_policy_is_worth_the_same_again_and_nothing_random_is_drawn():
     assert before["python"] == after["python"]
 
 
+@pytest.mark.slow
 def test_nothing_disturbs_the_robots_but_their_ground_and_their_commands():
     cfg = task_config("anymal_c", [("env.num_envs", 2), ("sim.physics", "mujoco"), ("sim.threads", 1), *BRIEF], on_cpu=True)
     cfg = override(cfg, [("domain_rand.ranges.friction", [0.5, 1.0])])
@@ -137,6 +139,7 @@ def test_other_tasks_are_judged_by_the_return_of_whole_episodes_and_their_metric
     assert found["x_velocity"] == pytest.approx(float(speed), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_recurrent_policy_begins_each_evaluation_without_memory():
     recurrent = {"policy.rnn_type": "gru", "policy.rnn_hidden_dim": 4, "algorithm.symmetry": False}
     training = small_task(*BRIEF, *((f"train.{name}", value) for name, value in recurrent.items()))

@@ -56,6 +56,7 @@ def test_a_grid_is_all_combinations_with_the_same_number_of_robots():
     assert grid.cells.tolist()[:4] == [[0, 0, -1], [0, 0, 0], [0, 0, 1], [1, 0, -1]]
 
 
+@pytest.mark.slow
 def test_robots_that_stand_have_the_error_of_what_they_are_asked_for():
     result = on_grid(Grid([0.0, 0.5], [0.0, -0.3], [0.0, 0.4], robots=2, hold_s=2.0))
     cells = {tuple(cell["command"]): cell for cell in result["cells"]}
@@ -78,6 +79,7 @@ def test_robots_that_stand_have_the_error_of_what_they_are_asked_for():
     json.dumps(result, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_robots_that_are_made_to_fall_are_counted_and_measured_up_to_their_fall():
     grid = Grid([0.0, 0.5], [0.0], [0.0], robots=4, hold_s=1.0, settle_s=0.2)
     config = override(small_config(), [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0])])
@@ -161,6 +163,7 @@ def run(trained, monkeypatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
     arguments = [TASK, "--physics", "mujoco", "--vx=0:0.5:0.5", "--vy=0", "--yaw=-0.5:0.5:1", "--robots", "2"]
     assert call(evaluate_grid.main, [*arguments, "sim.threads=1"]) == 0
@@ -180,6 +183,7 @@ def test_evaluate_writes_json_and_picture_beside_the_checkpoint(run, capsys):
         assert words in out
 
 
+@pytest.mark.slow
 def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path):
     judged = ["evaluation.vx=[-0.5,1,1.5]", "evaluation.vy=[0.3,0.3,1]", "evaluation.yaw=[0,0,1]"]
     arguments = [TASK, "--physics", "mujoco", "--robots", "1", "--yaw=-0.2", "--out", str(tmp_path)]
@@ -188,6 +192,7 @@ def test_the_grid_is_that_of_the_task_where_no_flag_says_otherwise(run, tmp_path
     assert result["grid"] == {"vx": [-0.5, 1.0], "vy": [0.3], "yaw": [-0.2]}
 
 
+@pytest.mark.slow
 def test_a_grid_is_no_changed_field_however_it_is_asked_for(run):
     """The zoo judges again what was trained with another grid, and looks for the result beside the checkpoint."""
     judged = ["evaluation.vx=[0.5,0.5,1]", "evaluation.vy=[0,0,1]", "evaluation.yaw=[0,0,1]", "evaluation.stairs=0.3"]
@@ -211,6 +216,7 @@ def test_grids_of_quadrupeds_and_bipeds(task, axes):
     assert {axis: found[axis] for axis in axes} == axes
 
 
+@pytest.mark.slow
 def test_evaluate_writes_elsewhere_if_asked(run, tmp_path):
     before = sorted(run.iterdir())
     arguments = [TASK, "--physics", "mujoco", "--vx=0", "--vy=0", "--yaw=0", "--robots", "1", "--out", str(tmp_path / "o")]
@@ -222,6 +228,7 @@ def test_evaluate_writes_elsewhere_if_asked(run, tmp_path):
 SHORT = ((1.1, (0.5, 0.0, 0.0)), (1.1, (9.0, 0.0, 0.0)))  # the second is outside what the task was trained on
 
 
+@pytest.mark.slow
 def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(demonstrations, "SCHEDULE", SHORT)
     arguments = [
@@ -252,6 +259,7 @@ def test_play_without_video_exports_and_prints_a_table(run, capsys, monkeypatch,
     assert out.count("rad/s ") >= 2
 
 
+@pytest.mark.slow
 def test_play_records_a_short_video_where_something_can_be_drawn(run, capsys, monkeypatch, tmp_path):
     import mujoco
 
@@ -315,6 +323,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(tm
         assert "file: cannot make the folder" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_path, monkeypatch, capsys):
     def full(path, _text):
         raise RunError(f"{path.name}: no space left on the disk")
@@ -328,6 +337,7 @@ def test_a_disk_that_fills_up_meanwhile_costs_the_files_and_not_the_table(tmp_pa
     assert err == "error: evaluation_mujoco.json: no space left on the disk\n"
 
 
+@pytest.mark.slow
 def test_an_evaluation_with_changed_fields_says_so_and_does_not_take_the_place_of_the_policy_s_own(tmp_path):
     run = tmp_path / "run"
     shutil.copytree(POLICY, run)

@@ -40,6 +40,7 @@ def run(trained, monkeypatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_episodes_are_measured_and_written(run, capsys):
     assert call(episodes.main, [*SHORT, "--physics", "mujoco", "--episodes", "3"]) == 0
     out = capsys.readouterr().out
@@ -80,6 +81,7 @@ def test_seeds_and_engines_are_compared(run, tmp_path, capsys):
     assert "episodes.return.std: expected a number, got nothing" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_exported_policy_is_scored_by_gymnasium(run, tmp_path, capsys):
     """By Gymnasium's own count, beside the same loop written out here."""
     assert call(in_gymnasium.main, [TASK, "--episodes", "2", "--out", str(tmp_path)]) == 0
@@ -140,6 +142,7 @@ def exported(folder: Path, action: float, **changes) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_controls_are_those_that_the_file_describes(tmp_path):
     """An action of 1 is half of what a motor can do: the controls cost 0.1 * 6 * 0.5^2 a step. One of 9 is clipped at 2."""
     for action, cost in ((1.0, 150.0), (9.0, 600.0)):

@@ -128,6 +128,7 @@ def test_figures_of_a_point():
     assert point(0.1, torch.tensor([FELL]), torch.tensor([1.0]))["mean_time_s"] is None
 
 
+@pytest.mark.slow
 def test_scripted_robots_on_a_real_task(monkeypatch):
     """On level ground: one is carried out and then laid on its back, one falls and is carried out after its reset, one falls
     3 m away, one is carried 3.9 m away and stays there.
@@ -325,6 +326,7 @@ def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(
     assert narrow.horizontal_scale == pytest.approx(0.07 / 3)  # a third of the tread of 0.28 m at that scale
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_climbs_a_gentle_slope_and_not_a_wall():
     """The whole measurement, with a policy that walks: 10 degrees are easy for it, a pit of 1 m has walls."""
     policy = TrainedPolicy(run_config(POLICY), find_checkpoint(POLICY, None))

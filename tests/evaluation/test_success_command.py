@@ -102,6 +102,7 @@ def test_sizes_that_are_asked_for():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
@@ -226,6 +227,7 @@ def run(trained, monkeypatch) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_terrain_and_grid_write_their_parts_into_one_file(run, tmp_path, capsys):
     """Each keeps the other's part, as long as both are of the same policy, engine and settings."""
     out = ["--out", str(tmp_path / "o")]
@@ -250,6 +252,7 @@ def test_terrain_and_grid_write_their_parts_into_one_file(run, tmp_path, capsys)
     assert "success" not in json.loads(path.read_text())
 
 
+@pytest.mark.slow
 def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, capsys):
     """Each by its own command, into the same folder."""
     here = ["anymal_c", *HERE, "--out", str(tmp_path / "o")]
@@ -303,6 +306,7 @@ def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path)
     assert with_other_engines(mine, path) == [mine]  # its curve is of other settings, and the picture would not say so
 
 
+@pytest.mark.slow
 def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(success, "TIME_S", 0.1)
     monkeypatch.setattr("legged.cli.evaluate.common.ROBOTS", 1)

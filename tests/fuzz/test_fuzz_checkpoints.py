@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import pytest
 import torch
 from draws import HOW, VALUES, mutated, places
 from helpers import TASK
@@ -17,6 +18,8 @@ from legged.learning.runner import Runner
 from legged.learning.transfer import check_source
 from legged.policies.restore import TrainedPolicy, restore
 from legged.registry import make_task
+
+pytestmark = pytest.mark.slow
 
 TENSORS = st.sampled_from(
     [

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import pytest
 import torch
 import yaml
 from draws import OVERRIDES, TEXTS, VALUES, changed_text
@@ -17,6 +18,8 @@ from legged.config.loader import parse_override
 from legged.learning.runner import Runner
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
+
+pytestmark = pytest.mark.slow
 
 TASKS = ["anymal_c_flat", "anymal_c", "anymal_c_proprio"]
 CHEAP = [("sim.physics", "mujoco"), ("sim.threads", 1), ("env.num_envs", 4), ("train.runner.num_steps_per_env", 2)]

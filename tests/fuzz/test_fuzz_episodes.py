@@ -19,6 +19,8 @@ from legged.episodes.ranking import figures_of
 from legged.episodes.stored import ABOUT, ARRAYS, load_episodes
 from legged.errors import ConfigError
 
+pytestmark = pytest.mark.slow
+
 FEW = ["--physics=mujoco", "--episodes=2", "sim.threads=1", "env.episode_length_s=1.2"]
 
 

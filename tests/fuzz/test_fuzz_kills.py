@@ -24,7 +24,7 @@ LONGEST_S = 9.0
 """Start-up takes half of it, and iterations of some milliseconds the rest [s]."""
 REPOSITORY = Path(__file__).parents[2]
 
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 
 def end_a_training(number: signal.Signals, after_s: float) -> tuple[int, str]:

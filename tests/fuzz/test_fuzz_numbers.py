@@ -1,5 +1,6 @@
 """Bad numbers at drawn places and times: weights and what the task hands out stay finite, and other robots know nothing."""
 
+import pytest
 import torch
 from helpers import CALM, ENGINE, TASK
 from hypothesis import given
@@ -10,6 +11,8 @@ from legged.learning.captured import CapturedRunner
 from legged.learning.rollout import Rollout
 from legged.learning.runner import Runner
 from legged.registry import _REGISTERED, make_task, register, task_config
+
+pytestmark = pytest.mark.slow
 
 N, STEPS = 6, 4
 BAD = st.sampled_from([float("nan"), float("inf"), float("-inf"), 1e30, -1e30, 3e38, 1e15, 1e5])

@@ -3,6 +3,7 @@
 import shutil
 from pathlib import Path
 
+import pytest
 import torch
 from draws import OVERRIDES
 from helpers import TASK, checkpoints, run_folders
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 
 from legged.cli import play, train
 from legged.learning.run_folder import run_config
+
+pytestmark = pytest.mark.slow
 
 SMALL = ["sim.threads=1", "train.runner.num_steps_per_env=4", "train.runner.report=false"]
 NUMBER = st.sampled_from([1, 2, 3, 5, 7, 12])

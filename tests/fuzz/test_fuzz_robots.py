@@ -5,6 +5,7 @@ import io
 import shutil
 from pathlib import Path
 
+import pytest
 import torch
 import yaml
 from draws import HOW, NUMBERS, TEXTS, VALUES, changed_text, mutated, places
@@ -17,6 +18,8 @@ from outcomes import refused_in_a_line
 from legged.cli.robot import add
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
+
+pytestmark = pytest.mark.slow
 
 SOURCE = data_folder("resources") / "robots" / "anymal_c"
 MODEL = (SOURCE / "anymal_c.xml").read_text()

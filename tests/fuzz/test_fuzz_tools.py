@@ -5,6 +5,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import pytest
 from draws import HOW, TEXTS, VALUES, changed_text, mutated, places
 from helpers import TASK, TINY_TRAINING
 from hypothesis import given
@@ -18,6 +19,8 @@ from legged.cli.runs import compare, curves, evaluations, report, table
 from legged.cli.terrain import terrain
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
+
+pytestmark = pytest.mark.slow
 
 POLICIES = data_folder("resources") / "policies"
 EVALUATIONS = [POLICIES / "anymal_c" / "evaluation_mujoco.json", POLICIES / TASK / "evaluation_mujoco.json"]

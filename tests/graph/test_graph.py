@@ -147,6 +147,7 @@ def config(backend: str) -> TaskConfig:
     return task_config("anymal_c_flat", changes.items(), on_cpu=True)
 
 
+@pytest.mark.slow
 def test_the_whole_step_of_the_task_can_be_captured(backend):
     """Steps with resets, pushes and new commands among them, on every back-end."""
     engine, _, on_gpu = backend.partition(", ")

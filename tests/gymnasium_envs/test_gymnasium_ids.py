@@ -29,6 +29,7 @@ def test_every_task_has_an_id():
     assert {f"legged/{name}" for name in task_names()} <= set(gymnasium.registry)
 
 
+@pytest.mark.slow
 def test_importing_legged_imports_no_gymnasium_and_gymnasium_knows_the_tasks_later():
     code = (
         "import sys, importlib.util, legged\n"
@@ -43,10 +44,12 @@ def test_importing_legged_imports_no_gymnasium_and_gymnasium_knows_the_tasks_lat
     assert run(code + IDS) == str(shipped())
 
 
+@pytest.mark.slow
 def test_gymnasium_that_was_imported_first_knows_them_too():
     assert run(f"import gymnasium, legged\n{IDS}") == str(shipped())
 
 
+@pytest.mark.slow
 def test_gymnasium_imports_legged_by_itself_where_the_id_says_so():
     code = "import gymnasium\nenv = gymnasium.make('legged:legged/half_cheetah', config={'sim.threads': 1})\n"
     assert run(code + "print(env.reset(seed=1)[0].shape)") == "(17,)"

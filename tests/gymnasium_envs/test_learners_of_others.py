@@ -13,6 +13,7 @@ from envs_of_gymnasium import ONE_THREAD
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["half_cheetah", "anymal_c_flat"])
 def test_stable_baselines3_learns_for_a_few_hundred_steps(task):
     stable_baselines3 = pytest.importorskip("stable_baselines3")
@@ -46,6 +47,7 @@ def run(code: str) -> dict:
     return names
 
 
+@pytest.mark.slow
 def test_the_example_of_the_page_runs(pictures):
     found = run(example("gymnasium.md"))
     assert found["observations"].shape == (64, 48)

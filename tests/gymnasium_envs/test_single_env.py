@@ -16,6 +16,7 @@ from legged.registry import register
 ROBOT = "anymal_c_flat"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observations", ["actor", "dict"])
 @pytest.mark.parametrize("task", ["half_cheetah", "humanoid", ROBOT])
 def test_gymnasium_s_checker_has_nothing_to_say(task, observations, pictures):

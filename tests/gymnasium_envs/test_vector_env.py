@@ -174,6 +174,7 @@ def test_wrong_actions_are_refused():
         env.step(np.zeros((2, 5)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["half_cheetah", ROBOT, "anymal_c"])
 def test_there_is_a_picture_of_every_environment(task, pictures):
     small = {"terrain.num_rows": 2} if task == "anymal_c" else {}
@@ -189,6 +190,7 @@ def test_there_is_a_picture_of_every_environment(task, pictures):
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [ROBOT, "anymal_c"])
 def test_a_robot_s_picture_is_its_own_and_does_not_depend_on_who_was_drawn_before(task, pictures):
     """Robots that are 0.4 m apart: a camera that glides from one to the next would be in between."""

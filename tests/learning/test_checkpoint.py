@@ -80,6 +80,7 @@ def in_a_state_file(model: Path) -> None:
 CODE = [in_infos, as_the_whole_file, as_a_bare_pickle, as_an_old_torch_file]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("place", CODE)
 def test_a_checkpoint_runs_no_code(model, capsys, place, command):
@@ -192,6 +193,7 @@ def test_policies_of_the_package_are_plain_data(task):
     assert saved["infos"]["task"] == task
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameter", [0, 3])
 def test_an_optimiser_without_the_moments_of_a_parameter_is_damaged(model, capsys, parameter):
     optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
@@ -201,6 +203,7 @@ def test_an_optimiser_without_the_moments_of_a_parameter_is_damaged(model, capsy
     assert "model_0.pt: its optimiser is damaged (the moments of some parameters are missing)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [float("nan"), 0.0, -1.0, "fast", None])
 def test_a_learning_rate_that_is_none_is_refused(model, capsys, rate):
     optimizer = torch.load(model, weights_only=True)["optimizer_state_dict"]
@@ -213,6 +216,7 @@ def test_a_learning_rate_that_is_none_is_refused(model, capsys, rate):
 # ---- normalised observations -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_policy_with_normalised_observations_is_played_evaluated_and_resumed(capsys):
     """The normaliser's moments are matrices too, and no layers."""
     normalise = ["train.policy.obs_normalization=true"]

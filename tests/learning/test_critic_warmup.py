@@ -67,6 +67,7 @@ def test_both_loops_learn_the_same_value_function(monkeypatch):
         torch.testing.assert_close(algs[1].critic.state_dict()[name], tensor, rtol=1e-3, atol=2e-5, msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_training_warms_up_and_is_resumed_in_the_middle_bit_by_bit(loop):
     arguments = ["--runner", loop, "train.algorithm.critic_warmup_iterations=3", "train.runner.save_interval=1"]
@@ -82,6 +83,7 @@ def test_training_warms_up_and_is_resumed_in_the_middle_bit_by_bit(loop):
         assert same(content(rest, 4)[part], content(four, 4)[part]), part
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_a_resumed_training_may_end_its_warmup(loop):
     run = tiny_run("--runner", loop, "train.algorithm.critic_warmup_iterations=9", iterations=1)
@@ -89,6 +91,7 @@ def test_a_resumed_training_may_end_its_warmup(loop):
     assert not same(content(rest, 1)["actor_state_dict"], content(run, 0)["actor_state_dict"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     """Of a file with other hidden layers in its critic, or with none at all, with the standard deviation of a new policy."""
@@ -111,6 +114,7 @@ def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     assert "train.algorithm.critic_warmup_iterations=50 would train a new value function" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_trial_steps_of_a_capture_leave_no_moments(monkeypatch):
     """The value function's were saved in the middle of a warm-up; those of the policy come to be while graphs are tried."""
     half = tiny_run("train.algorithm.critic_warmup_iterations=2", "train.runner.loop=stock", iterations=1)

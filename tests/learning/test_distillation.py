@@ -56,6 +56,7 @@ def exact_or_on_the_cpu(case) -> bool:
     return device == "cpu" or "use_mixed_precision" not in options
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_precision")
 @pytest.mark.parametrize(("device", "options"), filter(exact_or_on_the_cpu, on_both(VARIANTS)))
 def test_an_update_is_that_of_rsl_rl(device, options):
@@ -80,6 +81,7 @@ def test_an_update_is_that_of_rsl_rl(device, options):
     assert len(ours.memory.parts) == {"lstm": 2, "gru": 1}.get(options.get("rnn_type"), 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["", "lstm", "gru"])
 def test_an_update_waits_for_no_device(kind):
     alg = distiller(DeviceDistillation, rnn_type=kind)

@@ -136,6 +136,7 @@ def twice(env, obs, actions):
     return seen, None if actions is None else torch.cat([actions, actions])
 
 
+@pytest.mark.slow
 def test_estimates_come_to_be_a_known_linear_map():
     """Errors are stated in the unit of the term, which is scaled by 2; what is not estimated learns on beside it."""
     alg = learner(rate=3e-3, latent=2)
@@ -168,6 +169,7 @@ def test_its_learning_rate_does_not_adapt_and_is_saved():
 # ---- in a task -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_targets_are_mirrored_with_the_observations_they_are_estimated_from():
     """To the left becomes to the right; nothing in the iteration reads on the host."""
     task = small_task(*SMALL, ("train.algorithm.symmetry", True), ("train.runner.num_steps_per_env", 8), num_envs=6)
@@ -196,6 +198,7 @@ def test_targets_are_what_the_simulator_knew_when_the_robots_saw_what_they_did()
     torch.testing.assert_close(runner.alg.storage.observations["estimated"], torch.stack(wanted), rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_the_error_is_logged_and_printed_in_the_unit_of_the_term(capsys):
     """Of an estimator that gives 0 and does not learn it is the root mean square velocity of the samples."""
     task = small_task(*SMALL, ("train.policy.estimator.learning_rate", 1e-12), num_envs=4)
@@ -217,6 +220,7 @@ def test_the_error_is_logged_and_printed_in_the_unit_of_the_term(capsys):
     assert f"estimated base lin vel rmse {found[-1]:.3f}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_errors_are_taken_in_where_nothing_is_written_too():
     """As in all processes but the first, whose iterations go on after the one that has an error to tell."""
     runner = CapturedRunner(small_task(*SMALL, ("train.runner.num_steps_per_env", 4), num_envs=4), None, "cpu")
@@ -224,6 +228,7 @@ def test_errors_are_taken_in_where_nothing_is_written_too():
     assert 0.0 < runner.logger.latest["Estimator/base_lin_vel_rmse"] < 1.0
 
 
+@pytest.mark.slow
 def test_it_is_evaluated_in_the_unit_of_the_term():
     """Velocities of 0.3 m/s forward and 0.4 to the left, of which a policy that estimates 0 knows nothing; the robot that is
     not counted moves faster. Six numbers: the root of (0.09 + 0.16) / 6.
@@ -246,6 +251,7 @@ def test_it_is_evaluated_in_the_unit_of_the_term():
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_and_two_iterations_are_four():
     """Weights and moments of policy, value function and estimator, bit by bit."""
     flags = [f"{TARGETS[0]}=[base_lin_vel]", "train.policy.estimator.latent=2", "train.policy.obs_normalization=true"]
@@ -294,6 +300,7 @@ def test_the_exported_file_holds_the_estimator_and_says_what_it_estimates(tmp_pa
     assert "base_lin_vel" not in [term["name"] for term in said["observation"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

@@ -98,6 +98,7 @@ def test_who_listens_may_end_a_training():
 # ---- trainings -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["captured", "stock"])
 def test_a_training_learns_the_same_with_evaluations_and_without(loop):
     arguments = [f"train.runner.loop={loop}", "train.runner.save_interval=1"]
@@ -126,6 +127,7 @@ def test_a_training_learns_the_same_with_evaluations_and_without(loop):
     assert read_timing(plain).evaluation_s == 0.0
 
 
+@pytest.mark.slow
 def test_a_figure_that_is_no_number_is_left_out_of_the_best_checkpoint(monkeypatch):
     measure = TrainingEvaluation.measure
     monkeypatch.setattr(TrainingEvaluation, "measure", lambda *args: measure(*args) | {"return": float("nan")})
@@ -135,6 +137,7 @@ def test_a_figure_that_is_no_number_is_left_out_of_the_best_checkpoint(monkeypat
     assert "return" not in found
 
 
+@pytest.mark.slow
 def test_a_training_ends_at_its_target_and_counts_as_finished(capsys):
     arguments = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "9", *TINY_TRAINING]
     assert train.main([*arguments, *BRIEF, "train.runner.evaluate_interval=2", "train.runner.stop_at.falls=0.9"]) == 0
@@ -146,6 +149,7 @@ def test_a_training_ends_at_its_target_and_counts_as_finished(capsys):
     assert "finished after 2 iterations" in out
 
 
+@pytest.mark.slow
 def test_the_best_policy_can_be_played_and_trained_on(capsys):
     folder = tiny_run(*EVERY, iterations=3)
     best = read_checkpoint(folder / "model_best.pt")
@@ -164,6 +168,7 @@ def test_the_best_policy_can_be_played_and_trained_on(capsys):
     assert best["iter"] in range(3)
 
 
+@pytest.mark.slow
 def test_a_resumed_training_keeps_the_best_of_what_it_goes_on_from(monkeypatch):
     """What has been good is not beaten here: all later figures are made worse."""
     folder = tiny_run(*EVERY, iterations=2)

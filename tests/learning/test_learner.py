@@ -45,6 +45,7 @@ def exact_or_on_the_cpu(case) -> bool:
     return device == "cpu" or not {"use_mixed_precision", "max_grad_norm"} & set(options)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("full_precision")
 @pytest.mark.parametrize(("device", "options"), filter(exact_or_on_the_cpu, on_both(VARIANTS)))
 def test_an_update_is_that_of_rsl_rl(device, options, monkeypatch):
@@ -92,6 +93,7 @@ def task_and_runner(kind=Runner, *overrides, num_envs=12):
     return task, kind(task, None, "cpu")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 0.25])
 def test_a_rollout_is_that_of_rsl_rl(scale):
     """Observations, actions and ends of episodes bit by bit, with noise, commands and resets drawn alike; values, rewards
@@ -158,6 +160,7 @@ def test_ended_episodes_are_counted_over_rollouts():
     torch.testing.assert_close(rollout.episodes["return"], torch.cat([rewards[3:, 0].sum(0), rewards[5:, 1].sum(0)]))
 
 
+@pytest.mark.slow
 def test_nothing_in_an_iteration_reads_on_the_host():
     task, runner = task_and_runner(CapturedRunner)
     rollout = Rollout(task, runner.alg)
@@ -198,6 +201,7 @@ def test_what_needs_rsl_rls_update_is_named():
     assert set(alg.update()) == {"value", "surrogate", "entropy", "symmetry"}  # by rsl-rl's own
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), [("stock", "captured"), ("captured", "stock"), ("captured", "captured")])
 def test_checkpoints_are_exchanged_between_the_loops(first, second):
     """A run begun with one loop goes on with the other: counts of optimiser steps and the learning rate continue."""

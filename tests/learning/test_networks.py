@@ -88,6 +88,7 @@ class Exported:
         return np.concatenate(actions)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_every_kind_of_network_is_trained_resumed_played_evaluated_and_exported(name):
     folder = tiny_run(*VARIANTS[name])
@@ -121,6 +122,7 @@ def test_every_kind_of_network_is_trained_resumed_played_evaluated_and_exported(
     assert largest > 0.01
 
 
+@pytest.mark.slow
 def test_terms_of_several_groups_lie_where_their_description_says():
     """48 numbers twice after 15: the newest of the actor's dof_pos begins at 15 + 48 + 12."""
     folder = tiny_run(*VARIANTS["several groups"])
@@ -149,6 +151,7 @@ def test_networks_read_the_groups_that_they_are_told_to():
 # ---- standard deviation ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])
 @pytest.mark.parametrize("std_type", ["scalar", "log"])
 def test_the_std_stays_within_its_bounds_and_comes_back(kind, std_type, tmp_path):
@@ -223,6 +226,7 @@ def test_a_mirror_loss_needs_mirror_images(capsys):
     assert "train.algorithm.mirror_loss_coeff: must be 0 without mirror images" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "text"),
     [

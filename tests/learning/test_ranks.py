@@ -91,6 +91,7 @@ def wait_for_iterations(process) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.slow
 def test_two_processes_end_together_when_the_first_finds_their_target_reached():
     """The second evaluates nothing."""
     goal = ["train.runner.evaluate_interval=2", "train.runner.evaluate_envs=8", "train.runner.evaluate_s=0.1"]
@@ -103,6 +104,7 @@ def test_two_processes_end_together_when_the_first_finds_their_target_reached():
     assert out.count("reached its target after 2 iterations: falls 0") == 1
 
 
+@pytest.mark.slow
 def test_two_processes_learn_one_policy_from_different_robots():
     Path("spy.py").write_text(SPY)
     with two_processes("spy.py", *TRAIN, "--max_iterations", "2", "train.policy.obs_normalization=true") as process:
@@ -124,6 +126,7 @@ def test_two_processes_learn_one_policy_from_different_robots():
     assert "8 robots on each of 2 processes" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "networks"),
     [
@@ -155,6 +158,7 @@ def commands_of_the_page() -> list[list[str]]:
     return [shlex.split(command) for command in re.findall(r"torchrun (--nnodes .*)", page)]
 
 
+@pytest.mark.slow
 def test_two_machines_learn_one_policy_into_one_run_folder():
     """Each machine is a torchrun of its own; they find each other by the flags that docs/distributed.md shows."""
     Path("spy.py").write_text(SPY)
@@ -195,6 +199,7 @@ def test_the_slurm_script_starts_the_same_training_and_is_one_of_bash():
     assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_updates_of_several_processes_are_those_of_rsl_rl():
     with two_processes(TESTS / "ranks_learn.py") as process:
         out = ended(process, 0)
@@ -203,6 +208,7 @@ def test_updates_of_several_processes_are_those_of_rsl_rl():
             assert f"rank {rank} {case} equal" in out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds processes in /proc")
 def test_a_process_that_dies_ends_the_run_and_is_named():
     with two_processes(REPOSITORY / "train.py", *TRAIN, "--max_iterations", "100000") as process:
@@ -217,6 +223,7 @@ def test_a_process_that_dies_ends_the_run_and_is_named():
     assert not Path(f"/proc/{first}").exists()
 
 
+@pytest.mark.slow
 def test_a_signal_stops_all_with_one_checkpoint():
     flags = ["--runner", "stock", "--max_iterations", "100000", "train.runner.save_interval=100000"]
     with two_processes(REPOSITORY / "train.py", *TRAIN, *flags) as process:
@@ -237,6 +244,7 @@ def as_rank(monkeypatch, rank: int, count: int) -> None:
         monkeypatch.setenv(name, str(value))
 
 
+@pytest.mark.slow
 def test_robots_differ_between_processes_and_their_ground_does_not(monkeypatch):
     kinds = dict.fromkeys(task_config("anymal_c").terrain.proportions, 0.0) | {"rough_slope_up": 0.5, "obstacles": 0.5}
     sizes = [("terrain.num_rows", 2), ("terrain.num_cols", 2), ("terrain.border_size", 2.0)]

@@ -42,6 +42,7 @@ def flags(kind: str) -> list[str]:
 # ---- training, resuming, playing -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_a_recurrent_policy_is_trained_resumed_played_and_exported(kind, capsys):
     folder = tiny_run(*flags(kind))
@@ -77,6 +78,7 @@ def test_training_says_that_rsl_rls_loop_runs_and_why(capsys):
     assert "rsl-rl's own training loop: the actor is a RNNModel" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robots", "mini_batches"), [(4, 2), (4, 4), (1, 1)])
 def test_each_step_of_a_mini_batch_is_weighed_by_its_own_advantage_and_no_other_one(robots, mini_batches):
     """While the policy stands still the ratio of probabilities is 1, and the loss minus the mean advantage."""
@@ -125,6 +127,7 @@ def test_symmetry_of_the_shipped_task_is_named_with_its_file(capsys):
     assert "train.policy.rnn_type=gru, command line" in error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("trained", "asked", "text"),
     [
@@ -153,6 +156,7 @@ def test_a_checkpoint_of_another_width_or_depth_is_refused(tmp_path):
 # ---- memory --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 @pytest.mark.parametrize("inference", [True, False])
 def test_who_begins_an_episode_acts_as_if_nothing_had_been(kind, inference):
@@ -181,6 +185,7 @@ def test_who_begins_an_episode_acts_as_if_nothing_had_been(kind, inference):
         assert torch.allclose(act(second), fresh, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_restored_policy_forgets(tmp_path):
     folder = tiny_run(*flags("lstm"))
     task, act = restore(policy_of(str(folder)), [("env.num_envs", 3)], torch.device("cpu"))
@@ -200,6 +205,7 @@ def test_a_restored_policy_forgets(tmp_path):
 # ---- export --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lstm", "gru"])
 def test_exports_compute_the_policy_over_a_sequence(kind, tmp_path):
     task = small_task(*recurrent(kind))
@@ -239,6 +245,7 @@ def test_exports_compute_the_policy_over_a_sequence(kind, tmp_path):
     assert spread > 1e-3
 
 
+@pytest.mark.slow
 def test_an_export_that_forgets_is_refused(tmp_path, monkeypatch):
     runner = Runner(small_task(*recurrent("gru")))
     with torch.no_grad():
@@ -254,6 +261,7 @@ def test_an_export_that_forgets_is_refused(tmp_path, monkeypatch):
         export(runner.env, runner.alg.get_policy(), tmp_path)
 
 
+@pytest.mark.slow
 def test_without_recurrent_layers_nothing_changes():
     cfg = task_config(TASK, [("env.num_envs", 2)], on_cpu=True)
     assert cfg.train.policy.rnn_type == "none"

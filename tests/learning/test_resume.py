@@ -11,7 +11,7 @@ from legged.envs import LeggedRobot
 from legged.learning.run_folder import run_config
 from legged.policies.restore import policy_of  # noqa: F401  (imports every loader of checkpoints)
 
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 EVENTFUL = ["env.episode_length_s=0.3", "commands.resampling_time_s=0.1", "domain_rand.push_interval_s=0.06"]
 """Episodes, commands and pushes that end, change and come within a few iterations of four steps."""

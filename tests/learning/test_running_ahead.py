@@ -54,6 +54,7 @@ def runner_of(folder: Path, save_interval: int = 100) -> CapturedRunner:
     return CapturedRunner(small_task(*short), folder, "cpu")
 
 
+@pytest.mark.slow
 def test_an_iteration_is_logged_while_the_next_one_is_computed(ahead, order):
     """In step are: the first, whose numbers show that all is well; those with a checkpoint; the last two."""
     assert runner_of(Path("run"), save_interval=4).train(8)
@@ -68,6 +69,7 @@ def test_without_that_each_is_logged_at_once(order):
     assert order == ["go", "log 0", "save", "go", "log 1", "go", "log 2", "save"]
 
 
+@pytest.mark.slow
 def test_what_is_learned_and_logged_is_the_same(ahead, monkeypatch):
     evaluated = ["train.runner.evaluate_interval=4", "train.runner.evaluate_envs=4", "train.runner.evaluate_share=1"]
     settings = ["train.runner.save_interval=3", "env.episode_length_s=0.1", *evaluated]
@@ -88,6 +90,7 @@ def test_what_is_learned_and_logged_is_the_same(ahead, monkeypatch):
             assert torch.equal(weights, ends[1][network][name]), name
 
 
+@pytest.mark.slow
 def test_who_asks_to_stop_gets_everything_logged_that_was_learned(ahead, order, monkeypatch):
     runner = runner_of(Path("run"))
     log = runner.logger.log
@@ -104,6 +107,7 @@ def test_who_asks_to_stop_gets_everything_logged_that_was_learned(ahead, order, 
     assert runner.logger.tot_timesteps == 4 * runner.logger.steps_per_iteration
 
 
+@pytest.mark.slow
 def test_a_training_that_can_not_go_on_names_the_iteration_that_says_so(ahead, monkeypatch):
     runner = runner_of(Path("run"))
     judged = []

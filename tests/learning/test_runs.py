@@ -66,6 +66,7 @@ def test_a_failed_start_leaves_no_folder(monkeypatch):
     assert not Path("logs").exists()
 
 
+@pytest.mark.slow
 def test_a_first_iteration_that_fails_leaves_no_folder_and_a_later_one_its_checkpoints(monkeypatch):
     runner = (
         legged.cli.train.CapturedRunner if "captured" in str(small_config().train.runner.loop) else legged.cli.train.Runner
@@ -168,6 +169,7 @@ def test_the_hint_names_everything_that_play_needs(capsys):
     assert hint(capsys.readouterr().out) == expected
 
 
+@pytest.mark.slow
 def test_the_hint_names_the_run_where_it_is_not_the_newest(monkeypatch, capsys):
     other = tiny_run("--run_name", "other", iterations=1)
     monkeypatch.setattr(legged.cli.train, "find_run", lambda *_: other)
@@ -238,6 +240,7 @@ def test_without_git_that_is_said(monkeypatch, tmp_path):
     assert code_state().splitlines()[1:] == ["git is not on the PATH, so the commit is unknown"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["", " ", "long" * 100, "zero\0byte", "../..", "*"])
 def test_a_run_of_an_odd_name_is_not_there(name):
     tiny_run(iterations=1)

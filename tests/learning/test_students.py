@@ -81,6 +81,7 @@ def test_the_teacher_sees_without_noise_and_the_student_with():
     assert not torch.equal(runner.env.observation_groups["actor"].buffer[:, -24:-12], velocity)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["none", "gru"])
 def test_a_rollout_is_that_of_rsl_rl(kind):
     """Observations, actions and ends of episodes bit by bit, with noise, commands and resets drawn alike. The standard
@@ -113,6 +114,7 @@ def test_a_rollout_is_that_of_rsl_rl(kind):
 # ---- a training ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_student_is_trained_logged_played_and_exported(capsys):
     folder = student(iterations=8)
     saved = content(folder, 7)
@@ -139,6 +141,7 @@ def test_the_loss_and_the_teacher_are_told(capsys):
     assert "behaviour loss 0." in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [[], ["--runner", "stock"], [*LSTM], [*LSTM, "--runner", "stock"], ["train.policy.obs_normalization=true"]],
@@ -158,6 +161,7 @@ def test_two_and_two_iterations_are_four(settings):
         assert same(states[0][name], states[1][name]), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["stock", "captured"])
 @pytest.mark.parametrize("of_ppo", [[], ["train.algorithm.schedule=fixed", "train.algorithm.learning_rate=0.07"]])
 def test_a_resumed_student_learns_at_the_rate_of_the_configuration(loop, of_ppo):
@@ -168,6 +172,7 @@ def test_a_resumed_student_learns_at_the_rate_of_the_configuration(loop, of_ppo)
     assert saved["infos"]["learning_rate"] == pytest.approx(1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loop", ["stock", "captured"])
 def test_a_teacher_with_a_memory_teaches(loop):
     teacher = tiny_run("train.policy.rnn_type=gru", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false")

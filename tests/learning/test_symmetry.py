@@ -91,6 +91,7 @@ def test_a_mirrored_world_goes_on_as_the_mirror_image(robot):
     torch.testing.assert_close(task.projected_gravity[:6] * flip, task.projected_gravity[6:], atol=0.05, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_mirror_of_the_mirror_is_the_sample():
     task = rough_task("anymal_c_proprio")
     images = task.mirror_images()
@@ -108,6 +109,7 @@ def test_the_mirror_of_the_mirror_is_the_sample():
     assert augment(images, task, observations, None)[1] is None
 
 
+@pytest.mark.slow
 def test_heights_on_the_left_are_seen_on_the_right():
     """A ground that rises to the left by 1 m/m, so that heights are y: mirrored, it falls."""
     task = rough_task("anymal_c")
@@ -118,6 +120,7 @@ def test_heights_on_the_left_are_seen_on_the_right():
     torch.testing.assert_close((y[:, columns] * signs)[0, 48:], -task.height_scan.points[:, 1])
 
 
+@pytest.mark.slow
 def test_every_step_of_a_history_is_mirrored_in_its_place():
     """Gravity to the left, 1 to 6 in six steps: to the right in the same steps."""
     task = rough_task("anymal_c_proprio")
@@ -127,6 +130,7 @@ def test_every_step_of_a_history_is_mirrored_in_its_place():
     torch.testing.assert_close((history.flatten(1)[:, columns] * signs).view(1, 6, 45), -history)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [Runner, CapturedRunner])
 def test_rsl_rl_learns_from_both(kind, monkeypatch):
     """Twice the samples in a mini-batch, and how far the policy is from its mirror image is logged."""
@@ -222,6 +226,7 @@ def test_a_misspelt_kind_of_mirror_is_refused_at_the_start(looking):
         Misspelt.check(looking)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "words"), [(TooNarrow, "kind 'joints' is for 12"), (Unequal, "kind 'vector' is for 3")])
 def test_a_kind_of_mirror_of_another_width_is_refused(looking, task, words):
     with pytest.raises(ConfigError, match=rf"{task.__name__}\.MIRRORED: observation 'foot_contact' has 4 numbers.*{words}"):
@@ -236,6 +241,7 @@ class Sideless(LeggedRobot):
         return None
 
 
+@pytest.mark.slow
 def test_a_task_without_mirror_images_learns_without_symmetry_only():
     task = Sideless(small_config(SYMMETRIC))
     with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; must be false"):

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.usefixtures("workplace")
 TIMING = Timing("walk", True, 8, 2, False, 64, 1.5, 0.25, 2.0, "cpu", 0)
 
 
+@pytest.mark.slow
 def test_a_training_says_how_long_it_took_and_a_resumed_one_that_it_was_resumed():
     folder = tiny_run(num_envs=8, iterations=2)
     first = read_timing(folder)
@@ -63,6 +64,7 @@ def test_a_file_that_says_something_else_is_refused(tmp_path, text, words):
     assert words in str(error.value)
 
 
+@pytest.mark.slow
 def test_an_engine_counts_the_kernel_modules_that_it_had_to_compile(monkeypatch):
     monkeypatch.setattr(mujoco_warp, "compile_ahead", lambda *_: 7)
     assert small_task(("sim.physics", "mujoco_warp"), num_envs=2).physics.compiled == 7

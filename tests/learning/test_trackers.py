@@ -135,6 +135,7 @@ def test_a_tracker_that_fails_ends_nothing_and_is_told_of_once(capsys):
     assert lines[-1] == "scalar Perf/total_fps 1"
 
 
+@pytest.mark.slow
 def test_a_training_learns_the_same_with_a_tracker_and_without():
     plain, tracked = tiny_run(), tiny_run(own_tracker())
     a, b = (read_checkpoint(folder / "model_1.pt")["actor_state_dict"] for folder in (plain, tracked))
@@ -160,6 +161,7 @@ def test_a_tracker_that_is_not_there_is_one_line_before_anything_is_built(logger
     assert len(err.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_writer_beside_the_user_is_found_by_a_program_that_lies_elsewhere():
     """The module is imported: what is wrong with it is that it has no writer."""
     Path("my_lines.py").write_text("Nothing = 3")

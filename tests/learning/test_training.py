@@ -91,6 +91,7 @@ def test_lines_are_plain_where_there_is_no_terminal(capsys):
     assert f"legged play {TASK}" in out
 
 
+@pytest.mark.slow
 def test_a_fixed_seed_trains_to_the_same_network():
     first, second = tiny_run("--seed", "5"), tiny_run("--seed", "5")
     other = tiny_run("--seed", "6")
@@ -111,6 +112,7 @@ def test_show_prints_yaml_that_loads_back_and_builds_nothing(capsys, monkeypatch
     assert not Path("logs").exists()
 
 
+@pytest.mark.slow
 def test_every_flag_of_legged_gym_is_accepted(capsys):
     loaded = tiny_run("--experiment_name", "e", num_envs=4)
     flags = (
@@ -142,6 +144,7 @@ def test_runs_of_an_experiment_lie_in_its_folder():
 # ---- going on --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_resuming_goes_on_with_iterations_optimiser_and_learning_rate():
     first = tiny_run("train.algorithm.learning_rate=2e-4")
     before = saved(first, 1)
@@ -162,6 +165,7 @@ def test_resuming_goes_on_with_iterations_optimiser_and_learning_rate():
         assert torch.equal(value, before["actor_state_dict"][name])
 
 
+@pytest.mark.slow
 def test_resuming_restores_the_command_curriculum():
     folder = tiny_run(iterations=1)
     checkpoint = saved(folder, 0)
@@ -178,6 +182,7 @@ def test_resuming_restores_the_command_curriculum():
     assert torch.allclose(again, share)
 
 
+@pytest.mark.slow
 def test_resuming_from_a_checkpoint_in_the_middle_repeats_nothing():
     folder = tiny_run("train.runner.save_interval=1", iterations=3)
     assert checkpoints(folder) == [0, 1, 2]
@@ -186,6 +191,7 @@ def test_resuming_from_a_checkpoint_in_the_middle_repeats_nothing():
     assert optimiser_steps(saved(resumed, 1)) == {2 * UPDATES}
 
 
+@pytest.mark.slow
 def test_resuming_what_is_finished_is_an_error_and_leaves_no_folder(capsys):
     tiny_run()
     before = run_folders()
@@ -202,6 +208,7 @@ def test_a_run_without_a_name_is_no_new_training(capsys):
     assert run_folders() == []
 
 
+@pytest.mark.slow
 def test_the_newest_run_is_the_one_trained_last_not_the_one_looked_at_last():
     old = tiny_run("--run_name", "1_old", iterations=1)
     new = tiny_run("--run_name", "2_new", iterations=1)
@@ -211,6 +218,7 @@ def test_the_newest_run_is_the_one_trained_last_not_the_one_looked_at_last():
     assert find_run(task_config(TASK), None) == new
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["walking", "walking/{run}", "logs/walking/{run}"])
 def test_a_policy_is_found_by_the_arguments_that_commands_share(name):
     folder = tiny_run("--experiment_name", "walking", "train.runner.save_interval=1")
@@ -248,6 +256,7 @@ def loads(folder: Path, iteration: int) -> None:
     assert optimiser_steps(saved(folder, iteration)) == {(iteration + 1) * UPDATES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_after_the_iteration_with_a_checkpoint_of_it(number):
     with training("train.runner.save_interval=100000") as process:
@@ -266,6 +275,7 @@ def test_a_signal_stops_after_the_iteration_with_a_checkpoint_of_it(number):
     assert checkpoints(resumed) == [done]
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_the_checkpoints_saved_so_far_whole():
     with training("train.runner.save_interval=1") as process:
         wait_for(lambda: any(len(checkpoints(folder)) > 3 for folder in run_folders()), process)

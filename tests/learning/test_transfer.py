@@ -17,7 +17,7 @@ from legged.learning.runner import Runner
 from legged.learning.transfer import first_difference
 from legged.registry import make_task, task_config
 
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 OTHER = "transfer_target"
 """Another task on the same observations: as the flat one, with other rewards and commands."""

@@ -42,6 +42,7 @@ def test_a_sheet_is_about_twice_as_wide_as_high(count, shape):
     assert picture.shape[:2] == (46 * shape[0], 32 * shape[1])
 
 
+@pytest.mark.slow
 def test_the_command_shows_tasks_and_run_folders(capsys):
     assert call(contact_sheet.main, [TASK, str(POLICY), "--out", "robots.gif", "--side", "32", "--columns", "1"]) == 0
     with Image.open("robots.gif") as image:

@@ -17,7 +17,7 @@ from shipping import LARGEST, ship
 from legged.errors import ConfigError
 from legged.learning.timing import read_timing
 
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 GRID = ["evaluation.vx=[0,0.5,0.5]", "evaluation.vy=[0,0,1]", "evaluation.yaw=[0,0,1]"]
 TINY = ["env.num_envs=8", "train.runner.max_iterations=1", *TINY_TRAINING, *GRID]

@@ -38,6 +38,7 @@ def feather(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_robot_of_300_grams_stands_on_its_feet(feather):
     still = [("init_state.dof_pos_factor", [1.0, 1.0]), ("init_state.base_velocity", [0.0, 0.0])]
     task = small_task(("robot", str(feather)), ("domain_rand.randomize_base_mass", False), *still, num_envs=2)

@@ -130,6 +130,7 @@ def test_a_preview_shows_the_next_step_and_changes_nothing():
         torch.testing.assert_close(bench.errors.values, shown)
 
 
+@pytest.mark.slow
 def test_the_actor_is_misled_and_the_critic_is_not():
     settings = [ON, QUIET, ("observations.bias", {"dof_pos": 0.1}), ("observations.delay", {"dof_vel": [1, 1]})]
     task = small_task(*settings)
@@ -154,6 +155,7 @@ def test_two_groups_have_the_same_sensor():
     assert not torch.equal(obs["actor"], obs["critic"])
 
 
+@pytest.mark.slow
 def test_a_step_with_all_errors_is_checked_and_resumes():
     settings = [
         *TERRAIN,
@@ -214,6 +216,7 @@ def test_holes_read_0_and_stay_for_the_episode():
         torch.testing.assert_close(obs["actor"][kept][~holes[kept]], seen[kept][~holes[kept]], rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_lost_map_reads_0_everywhere_and_the_others_are_whole():
     task, count = heights_task(lost=0.5), 0
     for _ in range(10):
@@ -248,6 +251,7 @@ def test_wrong_settings_are_one_line_that_names_them(path, value, said):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_errors_of_0_are_none():
     """The random numbers and the observations are those of a task that names no errors, bit by bit."""
     zero = [("observations.bias", {"dof_pos": 0.0}), ("observations.delay", {"dof_pos": [0, 0]})]

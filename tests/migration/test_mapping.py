@@ -98,6 +98,7 @@ LOST = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "line", "words"), LOST, ids=[entry[1] for entry in LOST])
 def test_what_has_no_counterpart_is_listed_by_file_and_line(migrated, section, line, words):
     text = sections(**{section: line})

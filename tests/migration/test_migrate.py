@@ -60,6 +60,7 @@ def test_legged_gyms_flat_anymal(migrated):
     assert task.control.stiffness.tolist() == [90.0] * 12  # the robot's own stand for the network
 
 
+@pytest.mark.slow
 def test_legged_gyms_rough_anymal(migrated):
     text = "from legged_gym.envs import AnymalCRoughCfg\nclass MineCfg(AnymalCRoughCfg):\n    pass\n"
     result = migrated(text)
@@ -77,6 +78,7 @@ def test_legged_gyms_rough_anymal(migrated):
     assert task.num_obs == 235
 
 
+@pytest.mark.slow
 def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
     result = migrated(GO2, "--robot", "anymal_c")
     data = result.data
@@ -145,6 +147,7 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
     ]
 
 
+@pytest.mark.slow
 def test_mixins_and_a_base_of_the_forks_own(migrated, refused):
     written(OUR_BASE, "pkg/base_config.py")
     assert "pkg/mixed.py has several configurations, say which (--task: " in refused(written(MIXINS, "pkg/mixed.py"))

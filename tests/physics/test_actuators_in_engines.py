@@ -7,6 +7,8 @@ import torch
 
 from legged.registry import make_task, task_config
 
+pytestmark = pytest.mark.slow
+
 MOTORS = [
     ("control.actuator.model", "dc_motor"),
     ("control.actuator.no_load_speed", {"HAA": 8.0, "HFE": 8.0, "KFE": 9.0}),

@@ -78,6 +78,7 @@ TENDON = """
 </mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tendon", [False, True])
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_every_kind_of_row_pushes_as_in_c_mujoco(device, cone, tendon):

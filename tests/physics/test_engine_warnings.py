@@ -28,6 +28,7 @@ def test_many_broken_worlds_are_one_line_and_no_file(capfd):
     assert not Path("MUJOCO_LOG.TXT").exists()
 
 
+@pytest.mark.slow
 def test_outside_of_a_command_there_is_no_file_either(capfd):
     """In a notebook, say; a handler that somebody else has set stays."""
     before = mujoco.get_mju_user_warning()

@@ -148,6 +148,7 @@ def test_every_field_is_tested():
     assert {change.__name__ for change in CHANGES} == set(MODEL_FIELDS) - {"torque_limit"}  # motors here have none
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_field_does_what_the_same_change_by_hand_does(physics, change):
     values = CHANGES[change]

@@ -73,6 +73,7 @@ def finish(process: subprocess.Popen) -> str:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 def test_missing_modules_are_compiled_once_though_two_processes_start_together(tmp_path):
     cache = tmp_path / "cache"
@@ -115,6 +116,7 @@ def test_warp_is_itself_again_after_a_dry_run():
     assert (wp.launch, wp.launch_tiled, wp.capture_while, wp.capture_if) == before
 
 
+@pytest.mark.slow
 def test_warmup_leaves_nothing_to_compile(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     arguments = ["anymal_c_flat", "--num-envs", "2", "--sim_device", "cpu", "sim.physics=mujoco_warp"]
@@ -132,6 +134,7 @@ def test_warmup_has_nothing_to_do_for_the_c_engine(capsys):
     assert "nothing to do" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 def test_what_cannot_be_compiled_ahead_is_left_to_warp(tmp_path, monkeypatch, capfd):
     """Compiling processes that fail, or crash, cost nothing but their time."""
@@ -152,6 +155,7 @@ def test_what_cannot_be_compiled_ahead_is_left_to_warp(tmp_path, monkeypatch, ca
     assert x.numpy().tolist() == [7.0, 8.0, 9.0, 10.0]
 
 
+@pytest.mark.slow
 def test_compiling_processes_collect_no_garbage_of_their_parent(monkeypatch, tmp_path):
     """An object in a cycle, which may have to wait for a thread that no forked process has, is its parent's to end."""
     ended = tmp_path / "ended"

@@ -81,6 +81,7 @@ def program(file: str, constants: dict[str, Any], on_gpu: bool) -> str:
     return f"{WARP_ON_CPU.read_text() if on_gpu else ''}{SHIM}struct Arrays {{\n{fields}}};\n{function}"
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("on_gpu", [False, True])
 @pytest.mark.parametrize("file", STRUCTS)
@@ -93,6 +94,7 @@ def test_a_compiler_takes_the_source_without_a_warning(tmp_path, file, on_gpu):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", STRUCTS)
 def test_the_compiler_for_gpus_takes_the_kernel(tmp_path, file):
     """By NVIDIA's run-time compiler, which comes with Warp and needs no GPU."""
@@ -198,6 +200,7 @@ WORLDS = {
 }
 
 
+@pytest.mark.slow
 @needs_compiler
 @pytest.mark.parametrize("name", WORLDS)
 def test_lanes_find_what_one_thread_finds(tmp_path, name):

@@ -63,6 +63,7 @@ def test_every_solver_has_its_tolerances():
     assert set(TOLERANCES) == set(get_args(NewtonSolver))
 
 
+@pytest.mark.slow
 def test_it_stands_like_c_mujoco_and_the_ground_carries_its_weight(newton, solver, robot):
     """A second under PD. Shapes in the air feel nothing, friction sums to nothing."""
     tolerance, states = TOLERANCES[solver], standing(robot, N)
@@ -173,6 +174,7 @@ def test_a_push_is_felt_by_its_worlds_only(newton, robot):
     assert (felt[~mask].abs() < 0.1).all()
 
 
+@pytest.mark.slow
 def test_friction_is_drawn_per_world(newton, robot):
     """Standing robots pushed sideways: a slippery one slides v^2 / (2 mu g) = 0.5 m, a rough one stays."""
     friction = torch.tensor([0.1, 1.0, 0.1, 1.0])
@@ -188,6 +190,7 @@ def test_friction_is_drawn_per_world(newton, robot):
     assert (slid[friction == 1.0].abs() < 0.12).all()
 
 
+@pytest.mark.slow
 def test_added_base_mass_is_drawn_per_world(newton, solver, robot):
     added = torch.tensor([-5.0, 0.0, 5.0, 10.0])
     newton.randomize("added_base_mass", added)
@@ -203,6 +206,7 @@ def test_added_base_mass_is_drawn_per_world(newton, solver, robot):
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=tolerance, atol=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "memory"),
     [("mujoco", {"nconmax": 1}), ("mujoco", {"njmax": 8}), ("steel", {"njmax": 8}), ("xpbd", {"nconmax": 1})],
@@ -225,6 +229,7 @@ def test_lost_contacts_are_reported_until_the_next_refresh(make_physics, robot, 
 # ---- other grounds and shapes -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "collider", "near"), [("mujoco", "cells", 0.01), ("mujoco", "convex", 0.01), ("steel", "cells", 0.015)]
 )
@@ -250,6 +255,7 @@ def test_it_stands_on_terrain_like_c_mujoco(robot, solver, collider, near):
     torch.testing.assert_close(found[1].projected_gravity, found[0].projected_gravity, atol=0.02, rtol=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["mujoco", "steel"])
 def test_legs_touch_each_other_if_asked(robot, solver):
     """In the air with the hips turned inward, as far as they go: left and right thighs meet, and push apart alike."""

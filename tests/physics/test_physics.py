@@ -33,6 +33,7 @@ def feet_forces(physics, robot) -> torch.Tensor:
 # ---- the same numbers as C MuJoCo ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [random_states, heaps])
 def test_state_is_that_of_c_mujoco(physics, robot, start):
     """Of robots on their feet, and of robots that fell on whatever came first. Outputs are poisoned before, so that one
@@ -94,6 +95,7 @@ def position_drift(largest: dict[str, float]) -> float:
     return max(largest[name] for name in ("base_pos", "base_quat", "dof_pos"))
 
 
+@pytest.mark.slow
 def test_worlds_stay_those_of_c_mujoco_for_100_steps(physics, robot):
     """At the shipped solver options, through contacts that come and go, each engine under PD on its own joints."""
     largest = drift(physics, robot, SimConfig())

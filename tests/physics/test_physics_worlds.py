@@ -208,6 +208,7 @@ def test_lost_contacts_are_reported_until_the_next_refresh(make_physics, robot, 
     assert not physics.overflowed.any()
 
 
+@pytest.mark.slow
 def test_default_memory_holds_robots_lying_in_a_heap(make_physics, backend, robot):
     physics = make_physics(backend, num_envs=64)
     states = heaps(robot, 64, seed=11)

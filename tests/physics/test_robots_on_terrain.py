@@ -10,6 +10,7 @@ from legged.config.schema import SimConfig
 from legged.physics import RobotScene, make_physics
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
 def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, where):
     """Dropped off the platform onto stairs, a slope and rough ground, which throws two of them over: after 0.5 s, with

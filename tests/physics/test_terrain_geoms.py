@@ -77,6 +77,7 @@ def kinds(model) -> list[int]:
 # ---- the surface -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rays_find_the_height_map_on_every_type():
     terrain = terrain_of(list(TERRAIN_TYPES), (0.2, 0.9))
     ground = terrain.height_map
@@ -90,6 +91,7 @@ def test_rays_find_the_height_map_on_every_type():
     assert (bound > 1e-3).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("names", "difficulties", "threshold"),
     [
@@ -260,6 +262,7 @@ def test_chosen_tiles_come_with_the_border_on_their_side():
         assert ray(model, data, (x, y, 5.0)) == -1
 
 
+@pytest.mark.slow
 def test_training_grid_builds_in_bounded_time():
     """200 tiles of 80 x 80 cells, 0.5 s alone on one core."""
     terrain = Terrain.build(TerrainConfig(mesh_type="height_map", proportions=TRAINING), seed=1)

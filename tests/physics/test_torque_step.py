@@ -136,6 +136,7 @@ def test_a_hundred_steps_without_contacts_are_those_of_c_mujoco(name, device):
     assert difference(model, worlds=8, steps=100, seed=4, device=device) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("joints", "passive"), [(2, True), (7, False), (20, True)])
 def test_random_trees_move_as_in_c_mujoco(joints, passive, device):
     """Four trees of as many joints, of slides and hinges in any place: a hundred steps of three worlds each."""

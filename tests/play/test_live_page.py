@@ -85,6 +85,7 @@ def test_while_nobody_looks_nothing_is_simulated():
         assert time.process_time() - cpu < 0.5 * (time.monotonic() - wall)
 
 
+@pytest.mark.slow
 def test_another_ground_is_drawn():
     page = page_of(TASK)
     try:
@@ -119,6 +120,7 @@ def pixels(picture: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB"))
 
 
+@pytest.mark.slow
 def test_a_browser_draws_the_robot_and_moves_it():
     """Opens the page in headless Chromium, waits until something is drawn, and moves the first slider to its end."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -156,6 +158,7 @@ def test_a_browser_draws_the_robot_and_moves_it():
     assert not wrong
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_as_it_ends_other_tools(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     command = [sys.executable, "-m", "legged", "watch", TASK, "--num-envs", "1", "--port", "0"]

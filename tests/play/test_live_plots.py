@@ -26,6 +26,7 @@ def sample(time: float, *, contacts=(0.0, 0.0), rewards=(0.0, 0.0), speed: float
     return np.array([time, speed, *[0.0] * 5, *contacts, *rewards])
 
 
+@pytest.mark.slow
 def test_ten_seconds_are_kept_of_the_robot_that_is_followed():
     task = small_task(num_envs=2)
     history = History(task)
@@ -45,6 +46,7 @@ def test_ten_seconds_are_kept_of_the_robot_that_is_followed():
     assert len(history.rows) == KEPT_S / task.dt
 
 
+@pytest.mark.slow
 def test_an_episode_that_ends_breaks_the_curves():
     task = small_task(("env.episode_length_s", 0.08), num_envs=1)
     history = History(task)

@@ -48,6 +48,7 @@ def session(shared: Session) -> Session:
     return shared
 
 
+@pytest.mark.slow
 def test_robots_do_what_they_are_asked_within_what_they_were_trained_for(session):
     assert session.ranges == [[pytest.approx(-1.1), pytest.approx(1.1)]] * 2 + [[pytest.approx(-1.3), pytest.approx(1.3)]]
     session.ask(0, 0.8)
@@ -83,6 +84,7 @@ def test_time_passes_as_fast_as_it_is_told_to(session):
     assert session.pass_time(0.0) == 0
 
 
+@pytest.mark.slow
 def test_a_machine_that_is_too_slow_is_noticed(session):
     for _ in range(30):
         session.pass_time(0.1)

@@ -114,6 +114,7 @@ def top_of(shape, x: float, y: float) -> float:
     return float((a[seen, 2] + s * u[seen, 2] + t * v[seen, 2])[inside].max())
 
 
+@pytest.mark.slow
 def test_a_terrain_is_drawn_as_it_is_simulated():
     specs = [[TileSpec("stairs_up", 0.15), TileSpec("slope_down", 15.0), TileSpec("obstacles", 0.1)]]
     terrain = Terrain.of_tiles(specs, TerrainConfig(border_size=3.0), np.random.default_rng(0))

@@ -10,6 +10,8 @@ from helpers import POLICY
 
 import legged
 
+pytestmark = pytest.mark.slow
+
 PLAY = str(Path(legged.__file__).parents[1] / "play.py")
 ARGUMENTS = ["--task", "anymal_c_flat", "--load_run", str(POLICY), "--sim_device", "cpu", "--num_envs", "1", "--out", "out"]
 ARGUMENTS += ["sim.threads=1", "sim.physics=mujoco"]

@@ -40,6 +40,7 @@ def short(monkeypatch):
     monkeypatch.setattr(films, "camera_of", FakeCamera)
 
 
+@pytest.mark.slow
 def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
     task = small_task(("control.decimation", 250), num_envs=2)
@@ -51,6 +52,7 @@ def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     assert Path("film/play.mp4").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, monkeypatch):
     """It falls every 60 steps of 20 ms: of 150 steps, measured are 9 before the first fall, which begin at 1 s or later, 10
     before the second one, which end at 1 s of their episode or later, and none of the rest.
@@ -75,6 +77,7 @@ def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, mon
     assert kept[0].steps.tolist() == [19.0, 19.0]
 
 
+@pytest.mark.slow
 def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):
     real = subprocess.run
 

@@ -53,6 +53,7 @@ def on(ground: Playground, cfg: TaskConfig, num_envs: int) -> LeggedRobot:
     return task
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a1_flat", "h1_flat"])
 def test_flat_tasks_of_small_and_large_robots_have_ground_of_every_type(name):
     """Cells and tiles grow with what the types are made of: gaps between stones, platforms."""
@@ -179,6 +180,7 @@ def test_errors_are_root_mean_squares_of_settled_robots():
     assert errors.row() == ("0.500 m/s", "0.100 rad/s", "2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading", [True, False])
 def test_robots_are_asked_to_walk_along_x_and_are_counted_by_type(monkeypatch, heading):
     monkeypatch.setattr(demonstrations, "EPISODE_S", 0.1)
@@ -217,6 +219,7 @@ class FakeCamera:
     def close(self) -> None: ...
 
 
+@pytest.mark.slow
 def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch, tmp_path):
     monkeypatch.setattr(demonstrations, "EPISODE_S", 0.08)
     monkeypatch.setattr(demonstrations, "EPISODES", 3)
@@ -260,6 +263,7 @@ def arguments(run: Path, out: Path, *more: str) -> list[str]:
     return [*flags, "sim.threads=1", "sim.physics=mujoco", *more]
 
 
+@pytest.mark.slow
 def test_play_on_the_types_of_the_task(run, short, tmp_path, capsys, monkeypatch):
     tasks = []
     monkeypatch.setattr(play, "walk_out", lambda task, *rest: tasks.append(task) or demonstrations.walk_out(task, *rest))
@@ -278,6 +282,7 @@ def test_play_on_the_types_of_the_task(run, short, tmp_path, capsys, monkeypatch
     assert not task.cfg.observations.add_noise
 
 
+@pytest.mark.slow
 def test_play_records_a_film_of_one_type(run, short, tmp_path, capsys, monkeypatch):
     try:
         mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 16, 16).close()
@@ -293,6 +298,7 @@ def test_play_records_a_film_of_one_type(run, short, tmp_path, capsys, monkeypat
     assert os.path.getsize(tmp_path / "play.mp4") > 1000
 
 
+@pytest.mark.slow
 def test_a_policy_for_a_plane_is_shown_on_terrain(short, tmp_path, capsys):
     """The one that is shipped, which sees no heights."""
     flags = ["--task", "anymal_c_flat", "--load_run", str(data_folder("resources") / "policies" / "anymal_c_flat")]
@@ -304,6 +310,7 @@ def test_a_policy_for_a_plane_is_shown_on_terrain(short, tmp_path, capsys):
     assert cells[4] == "0"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "more", "words"),
     [

@@ -28,6 +28,7 @@ def test_a_png_is_the_picture_in_the_middle():
     assert said.startswith("written: new/film.png, 0.0")
 
 
+@pytest.mark.slow
 def test_a_gif_shows_all_in_real_time_and_is_made_smaller_until_it_is_small_enough(monkeypatch):
     pictures = noise()
     write_film(pictures, Path("large.gif"))
@@ -55,6 +56,7 @@ def test_a_colour_that_is_rarely_there_keeps():
     assert abs(shown - (240, 200, 10)).max() < 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), [(120, 120), (200, 80), (60, 160)])
 def test_a_robot_that_is_near_fills_its_picture(width, height):
     task = small_task(num_envs=1)
@@ -71,6 +73,7 @@ def test_a_robot_that_is_near_fills_its_picture(width, height):
     assert reach.min() < 0.8
 
 
+@pytest.mark.slow
 def test_the_shipped_robot_walks_through_its_tile(capsys):
     """On stairs as well: its picture changes all the time, and its colour stays in the middle."""
     for task in (TASK, "anymal_c"):

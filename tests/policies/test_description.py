@@ -113,6 +113,7 @@ def raw_state(task: LeggedRobot, robot: int) -> dict:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anymal_c", "anymal_c_proprio", "anymal_c_flat"])
 def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp_path):
     """Observations to 2e-5 in their scaled units and actions to 1e-5, over an episode's first steps."""
@@ -154,6 +155,7 @@ def test_a_controller_that_reads_only_the_exported_files_does_the_same(name, tmp
         np.testing.assert_allclose(controller.torques(raw_state(task, robot)), computed[robot], rtol=0.0, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("workplace")
 @pytest.mark.parametrize(("add", "half"), [("true", 0.25), ("false", 0.0)])
 def test_noise_is_that_of_the_training_and_not_of_the_task_that_is_exported_from(add, half):
@@ -165,6 +167,7 @@ def test_noise_is_that_of_the_training_and_not_of_the_task_that_is_exported_from
     assert {term["name"]: term["noise"] for term in terms}["dof_vel"] == half
 
 
+@pytest.mark.slow
 def test_every_shipped_term_has_a_formula_and_a_unit():
     """Of a robot that has something to say for each of them."""
     measured = sorted(LeggedRobot.terms("_obs_") - {"push_force"} - {f"rand_{name}" for name in FIELDS})  # not privileged
@@ -212,6 +215,7 @@ def test_the_law_and_the_time_are_those_of_the_task():
     assert told["recurrent"] is None
 
 
+@pytest.mark.slow
 def test_gains_are_a_number_for_each_joint_whatever_is_drawn_for_them():
     drawn = {"p_gain": [0.9, 0.9], "d_gain": [1.1, 1.1], "torque_limit": [0.8, 0.8], "joint_offset": [0.01, 0.01]}
     told, usual = describe(small_task(("domain_rand.ranges", drawn), num_envs=2)), describe(small_task())

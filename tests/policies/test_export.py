@@ -50,6 +50,7 @@ def cases(runner):
         return observations, runner.get_inference_policy("cpu")(groups)
 
 
+@pytest.mark.slow
 def test_torchscript_computes_the_policy(exported, cases):
     observations, actions = cases
     script = torch.jit.load(str(exported[0] / "policy.pt"))

@@ -109,6 +109,7 @@ def test_joints_without_action_stay(tmp_path):
     np.testing.assert_allclose(targets, expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypatch, capsys):
     """A run's checkpoints, exported, act in playback as in their own task: observation and targets of the same state."""
     monkeypatch.chdir(tmp_path)
@@ -152,6 +153,7 @@ def test_our_own_checkpoints_are_judged_as_the_task_sees_them(tmp_path, monkeypa
         assert json.loads((tmp_path / "again" / "onnx.json").read_text())["robot"] == "anymal_c"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "warns"),
     [

@@ -113,6 +113,7 @@ def test_threads_are_put_back_also_after_an_error():
     assert threads.count == 3
 
 
+@pytest.mark.slow
 def test_an_update_gives_the_same_numbers_with_any_number_of_threads():
     """So that the choice, which depends on the neighbours, does not decide what is learned."""
     found = []

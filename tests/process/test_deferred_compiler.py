@@ -9,6 +9,8 @@ from helpers import HANG_S
 
 import legged
 
+pytestmark = pytest.mark.slow
+
 TRAIN = str(Path(legged.__file__).parents[1] / "train.py")
 AS_A_COMMAND = f"import sys\nsys.argv = [{TRAIN!r}]\n"
 DEFERRED = "'torch._dynamo.utils' not in sys.modules"

@@ -140,6 +140,7 @@ def ends(command, *arguments, folder, value):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", ["egl", "osmesa"])
 def test_a_training_needs_no_library_for_drawing(value, tmp_path):
     done = ends("train", "--show", folder=tmp_path, value=value)
@@ -149,6 +150,7 @@ def test_a_training_needs_no_library_for_drawing(value, tmp_path):
     assert len(done.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_playing_measures_and_exports_and_then_says_why_nothing_is_drawn(tmp_path):
     flags = ["--load_run", str(POLICY), "--sim_device", "cpu", "--num_envs", "1", "--headless", "--out", "out"]
     flags += ["sim.threads=1", "sim.physics=mujoco"]
@@ -174,6 +176,7 @@ def test_a_command_ends_with_one_line_and_an_import_with_an_exception():
     assert "ConfigError: MUJOCO_GL" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_display_that_refuses_opens_no_window_and_pictures_are_drawn_all_the_same(displays):
     """The server hangs up on whoever connects, as one without permission does."""
     if headless.off_screen_library() is None:

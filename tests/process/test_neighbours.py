@@ -100,6 +100,7 @@ def test_where_nobody_may_write_a_training_goes_on():
     assert alone.most == 0
 
 
+@pytest.mark.slow
 def test_times_of_a_training_say_how_many_others_its_device_had():
     with Neighbours("cpu"), Neighbours("cpu"), Neighbours("gpu-a"):
         beside_two = tiny_run(iterations=1)

@@ -29,6 +29,7 @@ def test_the_collector_is_as_it_was_after_imports_even_failed_ones(enabled):
         gc.enable()
 
 
+@pytest.mark.slow
 def test_only_a_command_keeps_what_it_imported_from_the_collector():
     code = (
         "import gc, sys\n"
@@ -49,6 +50,7 @@ def run_module(*arguments, **environment):
     return subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "name"), [(("legged", "train"), "TASK"), (("legged", "play"), "POLICY")])
 def test_modules_are_commands_too(words, name):
     done = run_module(*words, "nonsense")
@@ -57,6 +59,7 @@ def test_modules_are_commands_too(words, name):
     assert "'nonsense'" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_machine_without_git_hears_nothing_of_it(tmp_path):
     done = run_module("legged", "train", "--task", "anymal_c_flat", "--sim_device", "cpu", "--show", PATH=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
@@ -77,6 +80,7 @@ def test_the_package_lists_tasks_and_robots_without_importing_what_they_need():
     assert ["g1_flat", "Unitree's", "G1", "follows", "velocity", "commands", "on", "flat", "ground"] in lines
 
 
+@pytest.mark.slow
 def test_another_programs_m_legged_is_not_meant(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import legged, sys; print(legged.LeggedRobot.__name__, sys.argv[1:])")

@@ -149,6 +149,7 @@ def warm(picture: np.ndarray) -> float:
     return float(((r > b + 45) & (r < 2 * g)).mean())
 
 
+@pytest.mark.slow
 def test_the_ground_is_in_the_picture(camera_in_pit):
     """At the foot of stairs it is cold, on top of a pyramid it is warm; either way there are the robots and risers."""
     deep = camera_in_pit.picture()
@@ -187,6 +188,7 @@ def test_on_terrain_robots_are_where_they_are(camera_in_pit, pit):
     assert np.linalg.norm(bases[0] - bases[1]) > 7.0
 
 
+@pytest.mark.slow
 def test_the_camera_follows_the_chosen_robot(camera_in_pit, pit):
     for robot in (1, 0):
         camera_in_pit.followed = robot

@@ -97,6 +97,7 @@ def test_cassie_at_home_is_as_menagerie_says():
         assert math.degrees(knee + qpos[robot.passive.qpos_columns[1]]) == pytest.approx(13.0, abs=3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
 def test_a_task_of_cassie(engine):
     """Loops are closed after resets and stay so; joints are the driven ones; springs can be observed."""

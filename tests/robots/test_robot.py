@@ -125,6 +125,7 @@ def test_limits(robot):
             assert tuple(robot.dof_pos_limits[i]) == expected, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "after_2_s", "after_5_s"),
     [

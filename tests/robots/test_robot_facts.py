@@ -117,6 +117,7 @@ def test_drawn_shapes_neither_collide_nor_weigh(robot):
     assert set(model.geom_type[shapes]) <= kinds  # all that the terrain's own collider knows
 
 
+@pytest.mark.slow
 def test_standing_robot_keeps_its_height(robot, facts):
     """A robot that topples does so as stiffly as a statue: its joints stay where its gains hold them."""
     sim = SimConfig(physics="mujoco", **STIFF_CONTACTS)

@@ -47,6 +47,7 @@ def test_what_is_measured_grows_too():
     assert sizes_of("slope_up", False, 0.5) == sizes_of("slope_up", False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gap", "stepping_stones"])
 @pytest.mark.parametrize("task", ["a1", "anymal_b", "go2", "go2_flat"])
 def test_what_is_measured_is_as_many_cells_wide_as_on_ground_of_scale_1(name, task):

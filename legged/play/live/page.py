@@ -144,7 +144,7 @@ class Page:
                         continue
                     start = min(max(session.command[axis], low), high)
                     slider = gui.add_slider(f"{name} [{unit}]", min=low, max=high, step=0.01, initial_value=start)
-                    self._do(slider.on_update, lambda axis=axis, slider=slider: session.ask(axis, float(slider.value)))
+                    self._do(slider.on_update, partial(lambda axis, own: session.ask(axis, float(own.value)), axis, slider))
                     self.sliders.append((axis, slider))
                 stand = gui.add_button("stand still" if session.clipped([0.0] * 3) == [0.0] * 3 else "slowest")
                 self._do(stand.on_click, lambda: self._steer(session.stand))

@@ -262,7 +262,7 @@ class Session:
 
     def clipped(self, command: Sequence[float]) -> list[float]:
         """Return a command of vx, vy [m/s] and yaw rate [rad/s], clipped to the ranges of the training."""
-        ranges = self.ranges or [(0.0, 0.0)] * 3
+        ranges = self.ranges or [[0.0, 0.0]] * 3
         return [min(max(float(value), low), high) for value, (low, high) in zip(command, ranges, strict=True)]
 
     def ask(self, axis: int, value: float) -> None:
@@ -324,7 +324,7 @@ class Session:
                 side = min(cfg.terrain.terrain_length, cfg.terrain.terrain_width)
                 setting.append(("terrain.spawn_range", min(APART * cfg.terrain.scale, 0.2 * side)))
             cfg = nominal(self.watched.cfg, [*setting, *self.changes, *playground.changes(cfg)])
-            terrain = playground.build(cfg)
+            terrain = playground.build(cfg)  # type: ignore[arg-type]
         self.task: Any = make_task(cfg, self.device, self._graph, terrain)
         self.can_be_pushed = self.task.physics.model.jnt_type[:1].tolist() == [FREE_JOINT]
         """The base floats, as a push requires."""

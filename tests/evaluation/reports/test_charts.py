@@ -185,6 +185,7 @@ def has(pixels: np.ndarray, color: str) -> bool:
     return bool((pixels == [int(color[i : i + 2], 16) for i in (1, 3, 5)]).all(axis=2).any())
 
 
+@pytest.mark.slow
 def test_a_chart_is_a_panel_of_a_picture(tmp_path):
     """Three panels take two rows; each line has its colour, and a single point is a marker with its interval."""
     point = Line("point", np.array([0.2]), np.array([0.5]), (np.array([0.4]), np.array([0.7])), markers=True)

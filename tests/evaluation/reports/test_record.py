@@ -40,6 +40,7 @@ def times(**other) -> Timing:
     return Timing(**{**vars(Timing(TASK, True, 8, 2, False, 64, 1.5, 0.25, 2.0, "cpu", 0)), **other})
 
 
+@pytest.mark.slow
 def test_a_run_that_came_to_its_end():
     record = read_record(tiny_run("train.runner.run_name=short", iterations=3))
     assert (record.status, record.why, record.done) == ("finished", "3 of 3 iterations", 3)
@@ -54,6 +55,7 @@ def test_a_run_that_came_to_its_end():
     assert abs(record.began.timestamp() - time.time()) < 300
 
 
+@pytest.mark.slow
 def test_a_training_that_raises_says_why_it_ended(monkeypatch):
     log = CapturedRunner._log
 
@@ -73,6 +75,7 @@ def test_a_training_that_raises_says_why_it_ended(monkeypatch):
     assert checkpoints(folder) == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_training_that_was_interrupted(monkeypatch):
     log = CapturedRunner._log
     monkeypatch.setattr(CapturedRunner, "_log", lambda self, *rest: (signal.raise_signal(signal.SIGINT), log(self, *rest)))
@@ -81,6 +84,7 @@ def test_a_training_that_was_interrupted(monkeypatch):
     assert (record.status, record.done) == ("interrupted", 1)
 
 
+@pytest.mark.slow
 def test_a_training_is_running_until_it_is_killed():
     command = [sys.executable, str(REPOSITORY / "train.py"), *FLAGS, "--max_iterations", "100000"]
     with Path("out.txt").open("w") as out:
@@ -176,6 +180,7 @@ def test_values_are_told_as_yaml_has_them():
     assert len(words([0.123456] * 40)) == 60
 
 
+@pytest.mark.slow
 def test_a_run_is_compared_with_its_task_on_the_device_that_it_was_made_on():
     folder = folder_of(**{"rewards.scales.torques": -1e-4})
     write_timing(folder, times())

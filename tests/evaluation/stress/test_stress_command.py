@@ -18,7 +18,7 @@ from legged.evaluation.success import FELL, REACHED, STUCK, Scores
 from legged.policies.restore import policy_of
 
 make = measuring.make_stressed
-pytestmark = pytest.mark.usefixtures("workplace")
+pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 FLAGS = ["--physics", "mujoco", "sim.threads=1"]
 LINES = 1 + len(ALONE) + 2
 

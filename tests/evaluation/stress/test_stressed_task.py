@@ -35,6 +35,7 @@ def torques(task, actions):
     return task.torques.clone()
 
 
+@pytest.mark.slow
 def test_robots_with_which_nothing_is_wrong_move_as_in_the_task_itself():
     plain, same = small_task(*AT_REST, num_envs=2), stressed(NOMINAL, NOMINAL)
     actions = torch.sin(torch.arange(2.0 * JOINTS)).view(2, JOINTS)
@@ -47,6 +48,7 @@ def test_robots_with_which_nothing_is_wrong_move_as_in_the_task_itself():
     assert torch.equal(plain.get_observations()["actor"], same.get_observations()["actor"])
 
 
+@pytest.mark.slow
 def test_a_payload_weighs_on_the_feet():
     """8 kg are 78.5 N more, once both robots stand."""
     task = with_nominal(payload=8.0)
@@ -126,6 +128,7 @@ def test_a_sensor_askew_turns_gravity_and_rates():
     assert float(rates[1, 2]) == pytest.approx(2.0 * math.cos(0.05), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_only_those_are_pushed_who_should_be(monkeypatch):
     task = with_nominal(push=1.0)
     pushed = torch.zeros(2)
