@@ -308,10 +308,10 @@ def plain(value: Any) -> Any:
     except TypeError as error:
         raise NotPlain(f"has {error}") from None
     except (ValueError, RecursionError):
-        text = " " * (LONGEST + 1)
+        raise NotPlain("is too large") from None
     if len(text) > LONGEST:
         raise NotPlain("is too large")
-    return json.loads(text)
+    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # no negative zeros
 
 
 def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:
