@@ -168,7 +168,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
     sigma, mapped, paste = "", set(), []
     for path in [path for path in result.theirs if path.startswith(prefix)]:
         name, found = path.removeprefix(prefix), result.theirs[path]
-        scale = result.get(path, 0.0)
+        scale = result.get(path, 0.0) if result.get(path) else 0.0
         if not scale:
             continue
         methods = fork.methods.get(f"_reward_{name}", [])
