@@ -20,7 +20,10 @@ from legged.physics.fused.torque_step import TorqueStep
 from legged.process import neighbours
 from legged.robots.robot import Robot, load_robot
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for programs in the background
+# A shell ignores SIGINT for a program in the background, `nohup` SIGHUP; programs that the tests start would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda *_: None)
 torch.set_num_threads(1)  # tensors are small here; a second thread only costs
 
 collect_ignore = [] if find_spec("hypothesis") else ["fuzz"]
