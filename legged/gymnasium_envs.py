@@ -119,7 +119,7 @@ class _Driver:
         included, and seeds the random numbers. Without one they continue; `chosen` draws the first seed.
         """
         if options:
-            raise ConfigError(f"reset: options: there are none; got {shown(options)}")
+            raise ConfigError(f"reset: options: the task has no options, got {shown(options)}")
         with self._own_random_numbers():
             if seed is not None or not self._seeded:
                 drawn = int(chosen.integers(LARGEST_SEED)) if seed is None else seed % LARGEST_SEED

@@ -132,6 +132,6 @@ def _no_choice(path: Path, asked: str | None, classes: list[str], tasks: list[st
     if not classes:
         of_tasks = f"; it registers tasks: --task{suggest(asked or '', tasks, 'tasks')}" if tasks else ""
         return ConfigError(f"{relative(path)}: has no configuration of an environment (class XCfg(LeggedRobotCfg)){of_tasks}")
-    given = "" if asked is None else f"{shown(asked)} is none of them: "
+    given = "" if asked is None else f"{shown(asked)} names none of the classes: "
     which = suggest(asked or "", [*classes, *tasks], "--task")
     return ConfigError(f"--task: {relative(path)} has several configurations, {given}say which{which}")

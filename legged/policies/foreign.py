@@ -182,7 +182,7 @@ class ForeignPolicy:
         joints = list(layout.joints or self._listed(JOINTS) or names)
         for name in (*joints, *layout.action_joints):
             if name not in names:
-                raise ConfigError(f"{path}: joint '{name}' is none of '{robot.name}'{suggest(str(name), names)}")
+                raise ConfigError(f"{path}: robot '{robot.name}' has no joint '{name}'{suggest(str(name), names)}")
         if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
             raise ConfigError(f"{path}: it names {len(set(joints))} joints, '{robot.name}' has {robot.num_dof}")
         acted = list(layout.action_joints) or joints

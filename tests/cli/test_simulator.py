@@ -234,7 +234,7 @@ def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys
     np.savez(tmp_path / "log.npz", times=np.array([0.0]), state=np.array([0]), states=np.array(["idle"]))
     (tmp_path / "film.mp4").write_bytes(b"of the run before")
     sim.make_film(robot, None, tmp_path)
-    assert "the run was too short for a film, so there is none" in capsys.readouterr().out
+    assert "no film, because the run was too short" in capsys.readouterr().out
     assert not (tmp_path / "film.mp4").exists()
 
 

@@ -176,7 +176,7 @@ def test_metadata_that_does_not_fit_the_robot(policy_file):
     robot, layout = load_robot("anymal_c"), read_layout("holosoma", "--layout")
     matrix, bias = np.zeros((WIDTH, 12)), np.zeros(12)
     for metadata, message in (
-        ({"dof_names": ["LF_HAA", "knee"]}, "joint 'knee' is none of 'anymal_c'"),
+        ({"dof_names": ["LF_HAA", "knee"]}, "robot 'anymal_c' has no joint 'knee'"),
         ({"dof_names": ["LF_HAA", "LF_HFE"]}, "it names 2 joints, 'anymal_c' has 12"),
         ({"kp": [1.0, 2.0]}, "metadata kp/stiffness/joint_stiffness: expected 12 numbers"),
         ({"kd": 3}, "metadata kd: expected a list"),

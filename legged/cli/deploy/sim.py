@@ -227,7 +227,7 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
     log = np.load(folder / "log.npz")
     if len(poses) < 2 or "times" not in log:
         (folder / FILM).unlink(missing_ok=True)  # left by another run
-        print(f"{folder}: the run was too short for a film, so there is none")
+        print(f"{folder}: no film, because the run was too short")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
     follower = Follower(camera.view, AWAY * size_of(robot).max(), None if terrain is None else terrain.height_map)
