@@ -237,7 +237,7 @@ class MujocoWarpPhysics(WarpPhysics):
             raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
         if no_solver:
             return
-        self._m.opt.run_qacc_smooth = False  # the fused solver does not use the warm start
+        self._m.opt.run_qacc_smooth = False  # the fused solver does not start from this acceleration
         if self.why_library:
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
