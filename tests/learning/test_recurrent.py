@@ -251,12 +251,12 @@ def test_an_export_that_forgets_is_refused(tmp_path, monkeypatch):
     with torch.no_grad():
         for parameter in runner.alg.get_policy().rnn.parameters():
             parameter.mul_(5.0)
-    run = export_module._run_onnx
+    run = export_module._by_onnx
 
     def forgetful(content, observations, begins, memory):
         return run(content, observations, torch.ones_like(begins), memory)
 
-    monkeypatch.setattr(export_module, "_run_onnx", forgetful)
+    monkeypatch.setattr(export_module, "_by_onnx", forgetful)
     with pytest.raises(ExportError, match=r"policy\.onnx: differs"):
         export(runner.env, runner.alg.get_policy(), tmp_path)
 
