@@ -153,6 +153,7 @@ def test_a_simulation_that_blows_up_says_so_and_does_not_begin_anew():
         ten_seconds()
 
 
+@pytest.mark.slow
 def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):
     server = Server(simulated)
     results = []

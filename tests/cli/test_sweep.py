@@ -146,6 +146,7 @@ def test_values_are_of_the_setting_s_kind_and_within_the_range():
     assert dims.value("[8, 4]") == [8, 4]
 
 
+@pytest.mark.slow
 def test_the_sweeps_of_this_package_are_right_and_are_no_tasks():
     files = sorted((data_folder("cfg") / "sweeps").glob("*.yaml"))
     assert {"anymal_c_flat", "half_cheetah_cpu"} <= {path.stem for path in files}

@@ -122,6 +122,7 @@ def test_a_bad_reward_at_the_end_of_an_episode_does_not_end_the_next_one(ends):
     assert not dones.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("value", "faults"), [(NAN, {"Faults/action": 1.0}), (INF, {}), (-INF, {}), (1e30, {})])
 def test_a_bad_action_moves_nothing(value, faults):
     """An infinite one is clipped, as a large one is; NaN asks for the default pose, and the robot begins anew."""
@@ -136,6 +137,7 @@ def test_a_bad_action_moves_nothing(value, faults):
     assert {name: count for name, count in logged(task).items() if name.startswith("Faults/")} == faults
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [NAN, INF, -INF, 1e30, 2.0 * LARGEST_STATE])
 @pytest.mark.parametrize("graph", [True, False], ids=["checked", "no graph"])
 def test_physics_that_diverges_but_stays_finite_is_reset_too(value, graph):

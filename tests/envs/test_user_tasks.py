@@ -201,6 +201,7 @@ def test_a_long_chain_and_a_circle_by_a_detour_end(error):
 # ---- robots --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["./robots/spotty", "robots/spotty", "../project/robots/spotty"])
 def test_a_robot_is_found_beside_the_file_that_names_it(show, monkeypatch, tmp_path, robot):
     expected = str(robot_at("project/robots/spotty").resolve())

@@ -154,6 +154,7 @@ def test_weights_that_are_no_numbers_are_refused(model, value):
         read_checkpoint(model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_progress_of_curricula_that_is_damaged_is_said(model, capsys, command):
     infos = torch.load(model, weights_only=True)["infos"]

@@ -281,6 +281,7 @@ def test_an_optimiser_of_another_kind_is_not_resumed(capsys):
 # ---- the captured loop -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
@@ -296,6 +297,7 @@ def test_what_the_captured_loop_cannot_hold_trains_on_rsl_rls_and_says_why(chang
     assert f"rsl-rl's own training loop: {why}\n" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -311,6 +313,7 @@ def test_what_it_can_hold_trains_on_it(changes, capsys):
     assert "rsl-rl's own" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_mirror_loss_pulls_the_policy_towards_its_mirror_image():
     """The same training with and without it: with a large weight little else is learned."""
     apart = {}

@@ -222,6 +222,7 @@ UNFIT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("arguments", "says"), UNFIT.values(), ids=UNFIT)
 def test_a_teacher_that_does_not_fit_ends_the_start_with_one_line(arguments, says, capsys):
     assert call(train.main, [*STUDENT, "--teacher", TASK, *TINY_TRAINING, "--sim_device", "cpu", *arguments]) == 2
@@ -250,6 +251,7 @@ def test_the_teacher_that_comes_with_the_package_fits_the_task_that_names_it():
     assert Path(str(teacher.origin["file"])).parent.resolve() == POLICY.parent / "anymal_c"
 
 
+@pytest.mark.slow
 def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
     """A property is observed as a share of its range, a force as one of the largest."""
     privileged = "observations.groups.actor.terms=[base_lin_vel,commands,dof_pos,dof_vel,actions,rand_friction,push_force]"
@@ -280,6 +282,7 @@ def test_observations_that_a_students_task_has_not_are_named(capsys):
     assert "observes 'base_lin_vel', 'base_ang_vel', 'projected_gravity'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_flags_that_do_not_go_together_are_refused(capsys):
     small = [*TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, ["--task", TASK, "--teacher", TASK, *small]) == 2

@@ -60,6 +60,7 @@ def test_a_motor_gives_less_the_faster_it_turns(speed, low, high):
     assert [limit.item() for limit in found] == pytest.approx([low, high], abs=1e-4)
 
 
+@pytest.mark.slow
 @KERNELS
 def test_torques_stay_on_the_line_of_the_motor(kernels):
     made = control(kernels, model="dc_motor", stall_torque={"H": 120.0, "K": 120.0}, no_load_speed={"H": 7.5, "K": 7.5})

@@ -155,6 +155,7 @@ def place(text: str, part: str, file: str) -> str:
     return f"fork/envs/{file}.py:{line_of(textwrap.dedent(text), part)}"
 
 
+@pytest.mark.slow
 def test_formulas_of_the_forks_own_get_no_scale_until_their_methods_are_pasted(fork, migrated):
     """Its orientation and tracking pay with an exp(); with these scales our penalty would have been paid."""
     result = migrated(textwrap.dedent(CONFIG), path=fork())
@@ -180,6 +181,7 @@ def test_formulas_of_the_forks_own_get_no_scale_until_their_methods_are_pasted(f
     built(result)
 
 
+@pytest.mark.slow
 def test_a_formula_of_legged_gyms_with_a_comment_at_the_margin_is_recognised(fork, migrated):
     """Such a comment made the method a fork's own."""
     path, env = fork(), Path("fork/envs/dog.py")
@@ -190,6 +192,7 @@ def test_a_formula_of_legged_gyms_with_a_comment_at_the_margin_is_recognised(for
     assert "rewards: 1 of 5 scales are mapped, with legged_gym's formulas; 4 wait" in result.out
 
 
+@pytest.mark.slow
 def test_the_first_lines_are_those_that_matter(fork, migrated):
     lines = migrated(textwrap.dedent(CONFIG), path=fork()).out.splitlines()
     assert [line.partition(":")[0] for line in lines[1:4]] == ["rewards", "observations", "robot"]
@@ -200,6 +203,7 @@ def test_the_first_lines_are_those_that_matter(fork, migrated):
     assert "not mapped, without effect: 2 settings of the simulator, of drawing and of the command line" in lines
 
 
+@pytest.mark.slow
 def test_observations_are_those_that_the_class_joins(fork, migrated):
     result = migrated(textwrap.dedent(CONFIG), path=fork())
     terms = ["projected_gravity", "base_ang_vel", "commands", "dof_pos", "actions"]
@@ -211,6 +215,7 @@ def test_observations_are_those_that_the_class_joins(fork, migrated):
     assert built(result).num_obs == 3 * (3 + 3 + 3 + 12 + 12)
 
 
+@pytest.mark.slow
 def test_observations_that_cannot_be_told_are_not_guessed_by_their_number(fork, migrated):
     """They are 48, as legged_gym's, and something else."""
     env = ENV.replace("+= torch.rand_like(self.obs_buf)", "= self.obs_buf[:, :9]")
@@ -225,6 +230,7 @@ def test_observations_that_cannot_be_told_are_not_guessed_by_their_number(fork, 
     )
 
 
+@pytest.mark.slow
 def test_ranges_and_switches_that_a_fork_does_not_have_are_off(fork, migrated):
     """An absent lin_vel_y was [-1, 1], and pushes of 1 m/s were added."""
     data = migrated(textwrap.dedent(CONFIG), path=fork()).data
@@ -238,6 +244,7 @@ def test_ranges_and_switches_that_a_fork_does_not_have_are_off(fork, migrated):
     assert data["observations"]["add_noise"] is False
 
 
+@pytest.mark.slow
 def test_a_fourth_command_and_methods_that_no_setting_carries_over_are_said(fork, migrated):
     out = migrated(textwrap.dedent(CONFIG), path=fork()).out
     where = place(ENV, "def _reward_prance", "dog")
@@ -246,6 +253,7 @@ def test_a_fourth_command_and_methods_that_no_setting_carries_over_are_said(fork
     assert "commands.num_commands = 5: commands here are vx, vy, yaw rate and heading" in out
 
 
+@pytest.mark.slow
 def test_terrain_types_are_those_that_the_forks_class_makes(fork, migrated):
     """In legged_gym's order they would be slopes and stairs. Half of the columns of 0.2 + 0.3 are level."""
     result = migrated(textwrap.dedent(CONFIG), path=fork())
@@ -345,6 +353,7 @@ FIELDS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "lines", "path", "value"), FIELDS, ids=[entry[1].partition(" ")[0] for entry in FIELDS])
 def test_settings_of_forks_go_to_the_fields_that_are_here(migrated, section, lines, path, value):
     result = migrated(sections(**{section: lines}))

@@ -31,6 +31,7 @@ def crawlers(device: str, source: str, known: bool = True) -> FusedWorlds:
     return worlds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("device", "source"), SOURCES)
 def test_beginning_with_them_halves_the_rounds_and_leads_to_the_same_forces(device, source):
     """Each step of both from the same state and the same last acceleration."""

@@ -46,6 +46,7 @@ def test_numbers_of_a_world_depend_on_neither_threads_nor_company(robot):
     assert not torch.isfinite(beside_a_broken_one[1]).all()
 
 
+@pytest.mark.slow
 def test_blocks_go_where_launches_of_single_stages_go():
     """With rows of every kind, those of equalities among them, which mujoco-warp makes between the two halves of a step."""
     model = mujoco.MjModel.from_xml_string(EVERY_ROW)

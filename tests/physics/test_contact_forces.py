@@ -8,6 +8,7 @@ from reference import heaps, roll
 from legged.physics.warp.state_io import MujocoWarpStateIO
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sim",
     [{}, {"cone": "elliptic"}, {"self_collisions": True}, {"njmax": 10}],

@@ -50,6 +50,7 @@ def test_more_contacts_than_a_gpu_has_shared_memory_for_are_said():
     assert taken == shared_bytes(constants) <= 48 * 1024
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", [{"contacts": 3}, {"rows": 11}])
 def test_what_finds_no_room_is_flagged(room):
     """Three contacts of four, eleven rows of twelve."""
@@ -57,6 +58,7 @@ def test_what_finds_no_room_is_flagged(room):
     assert (box("elliptic", **room).read("overflow") & LOST != 0).all()
 
 
+@pytest.mark.slow
 def test_a_contact_whose_last_rows_find_no_room_has_no_force_there():
     """Rows for two contacts and two thirds. mujoco-warp reads forces by the addresses of rows, and knows one beyond the last
     row, but a negative one only at the first row of a contact.

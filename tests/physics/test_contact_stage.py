@@ -223,6 +223,7 @@ def states_of_everything(model: mujoco.MjModel, count: int) -> tuple[np.ndarray,
     return qpos, rng.normal(size=(count, model.nv))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cone", "dim"), [("pyramidal", 6), ("elliptic", 6)])
 def test_rows_of_every_kind_are_those_of_mujoco_warp(cone, dim):
     """Each row of 60 worlds has its like among mujoco-warp's, and each of those has its like here; equalities come first,
@@ -273,6 +274,7 @@ def test_a_contact_is_known_by_its_rows_and_they_by_it():
     assert named > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_shape_is_pushed_as_in_c_mujoco(shape):
     """Its acceleration, with the rows of the one launch in mujoco-warp's own solver."""
@@ -329,6 +331,7 @@ def test_springs_of_two_shapes_are_mixed_as_in_c_mujoco(priority, solrefs):
     np.testing.assert_allclose(touch.solimp, data.contact[0].solimp, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solref", ["0.1 0", "0.02 -50", "-1000 1"])
 def test_a_solref_of_two_kinds_at_once_is_that_of_c_mujoco(solref, tmp_path):
     """C MuJoCo takes the default for it, of contacts, limits and equalities; a stiffness of 1e15 threw the ball away."""
@@ -362,6 +365,7 @@ def test_impedance_and_spring_are_worked_by_hand():
     np.testing.assert_allclose(spring_of(np.array([-900.0, -30.0]), solimp, 0.005, True)[:2], [997.2299, 31.57895], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
 @pytest.mark.parametrize(("start", "self_collisions"), [(random_states, False), (heaps, False), (heaps, True)])
 def test_robots_move_as_by_mujoco_warps_own_launches(robot, make_physics, start, self_collisions, where):
@@ -378,6 +382,7 @@ def test_robots_move_as_by_mujoco_warps_own_launches(robot, make_physics, start,
     assert found[0]["forces"].abs().max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", [pytest.param("", id="cpu"), on_gpu(ON_A_GPU, id="cuda")])
 def test_robots_on_stairs_move_as_by_mujoco_warps_own_launches(robot, where):
     """Fifty steps with our collider behind mujoco-warp's own, and inside our launch; the first take its solver 11 rounds."""

@@ -207,6 +207,7 @@ SERVO = """<mujoco><option gravity='0 0 0'/><worldbody><body>
 </body></worldbody><actuator>{}<motor joint='y' gear='4'/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_servos_pull_towards_its_target_grows_with_its_gain(engine, tmp_path):
     """A position servo of gear 2 and stiffness 50, to which 20 N a metre are added: that is a stiffness of 60. Each actuator
@@ -247,6 +248,7 @@ def test_stages_that_a_randomised_array_needs_are_launched():
     assert absent_stages(model, ["dof_frictionloss", "geom_friction"]) == damping
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_shipped_robot_without_dampers_can_be_given_some(robot, engine):
     """Damping and dry friction, of which its model has none, on 20 steps through contacts."""

@@ -23,6 +23,7 @@ def text(points: np.ndarray) -> str:
     return " ".join(f"{x:.9g}" for x in points.ravel())
 
 
+@pytest.mark.slow
 def test_a_robot_with_a_foot_of_mesh_stands_on_a_terrain(robot, tmp_path):
     """As the robot whose feet are spheres does, for that is what the mesh is; and it is said which shape was taken."""
     text_of_model = robot.model_path.read_text()

@@ -82,6 +82,7 @@ def controls(physics: Physics, generator: torch.Generator) -> torch.Tensor:
     return 0.6 * torch.randn(N, physics.ctrl.shape[1], generator=generator)
 
 
+@pytest.mark.slow
 def test_it_has_no_state_of_a_robot(physics):
     assert physics.robot_state is None
     assert physics.model.nq == physics.qpos.shape[1]
@@ -215,6 +216,7 @@ FILTERED = """<mujoco><option gravity='0 0 0'>{}</option><worldbody><body><joint
 <actuator><general joint='x' dyntype='filter' dynprm='0.05' gainprm='4'/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_write_empties_actuators_that_have_a_state(engine, tmp_path):
     """A filter that has filled pushes on without control; that of a written world does not."""
     path = tmp_path / "filtered.xml"
@@ -337,6 +339,7 @@ HINGE = """<mujoco><compiler angle="radian"/><option actuatorgroupdisable="{off}
 <actuator><motor joint="a" group="1"/></actuator></mujoco>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("off", "margin", "error"),
     [

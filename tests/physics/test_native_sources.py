@@ -249,6 +249,7 @@ def compare_stage(folder: Path, stage: ContactStage, read_rows: Callable[[], np.
             np.testing.assert_array_equal(made.sum(axis=1), read_rows())
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_lanes_make_rows_of_two_degrees_of_freedom_each(tmp_path):
     """A chain of 40 hinges with limits and dry friction, each link a capsule, lying across the floor."""

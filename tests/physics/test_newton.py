@@ -123,6 +123,7 @@ def test_written_state_reads_back(newton, robot):
     torch.testing.assert_close(newton.robot_state.base_lin_vel, states.base_lin_vel, atol=1e-6, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_writing_a_world_and_blowing_it_up_leaves_the_others_bit_identical(newton, robot):
     """In the middle of contact, now and for the next steps; and the sick world is cured by a write, to the last bit."""
     start = random_states(robot, N, seed=6)

@@ -194,6 +194,7 @@ def test_state_is_float32_of_the_promised_shapes(physics):
     assert (physics.overflowed.dtype, physics.overflowed.shape) == (torch.bool, (6,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"nconmax": 1}, {"njmax": 8}], ids=["contacts", "rows"])
 def test_lost_contacts_are_reported_until_the_next_refresh(make_physics, robot, options):
     """Four feet need four contacts and sixteen rows a robot. In the air nothing is lost, and the flag is gone."""

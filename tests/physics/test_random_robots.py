@@ -58,16 +58,19 @@ def check_steps(seed: int, hinges: int, extras: Collection[str], device: str) ->
             assert error < most, (seed, hinges, extras, i, name, error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extra", EXTRAS)
 def test_a_step_with_one_extra_is_that_of_c_mujoco(extra, device):
     check_steps(1, 12, (extra,), device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hinges", [2, 12, 29])
 def test_a_step_with_all_extras_is_that_of_c_mujoco(hinges, device):
     check_steps(2, hinges, EXTRAS, device)
 
 
+@pytest.mark.slow
 def test_a_step_of_the_most_degrees_of_freedom_is_that_of_c_mujoco(device):
     check_steps(3, 54, ("damping", "self-collision"), device)
 
@@ -110,6 +113,7 @@ def test_a_hundred_steps_are_those_of_c_mujoco(extras, device):
             assert relative_error(found[i], getattr(datas[i], name)) < 1e-4, (name, i)
 
 
+@pytest.mark.slow
 def test_a_row_that_couples_branches_is_solved_too(device):
     """Legs that touch each other: such a row has no place in the order of the branches."""
     model = random_robot(4, 8, ("self-collision",))

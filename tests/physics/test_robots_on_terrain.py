@@ -46,6 +46,7 @@ def test_robots_tumble_and_come_to_rest_alike_on_all_back_ends(robot, where):
     assert all(fallen.tolist() == [True, True, False, False] for fallen in tilted.values())
 
 
+@pytest.mark.slow
 def test_the_general_collider_carries_a_robot_too(robot):
     """sim.terrain_collider=convex, across the rim of a platform on a slope: as C MuJoCo, with a height field there too. That
     one lies deeper; its contacts lie half way between, so feet roll as if they were thicker: 1 cm further.
@@ -68,6 +69,7 @@ def test_the_general_collider_carries_a_robot_too(robot):
     torch.testing.assert_close(found[1].base_quat, found[0].base_quat, atol=5e-3, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_self_collisions_are_kept_if_asked(robot):
     """Knees turned inward until left and right thigh meet: they feel each other, on level ground far above it."""
     ground = tiles(("flat", 0.0))

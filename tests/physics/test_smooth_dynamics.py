@@ -67,6 +67,7 @@ def check(fused: FusedWorlds, models: list[mujoco.MjModel], motion: tuple[np.nda
             assert relative_error(found[name][i], getattr(data, name)) < 1e-5, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_poses_inertias_and_forces_are_those_of_c_mujoco(robot, name, device):
     """In six worlds in any pose, moving fast, with quaternions of any length."""
@@ -77,6 +78,7 @@ def test_poses_inertias_and_forces_are_those_of_c_mujoco(robot, name, device):
     check(FusedWorlds(model, 6, device=device), [model] * 6, (qpos, 3.0 * qvel, 20.0 * ctrl))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["crooked", "every joint"])
 def test_worlds_may_differ_in_most_of_the_model(robot, name, device):
     """Every array that a randomisation may draw is read by world: each is C MuJoCo's world of its own model."""

@@ -144,6 +144,7 @@ def compare(ours: list[list[Contact]], theirs: list[list[Contact]], deepest: flo
     return compared
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["foot", "shank", "trunk", "ball"])
 def test_a_step_and_its_edge(shape):
     """Tread, riser and rim of a box step: C MuJoCo's contacts, of random poses that cut into it a little.

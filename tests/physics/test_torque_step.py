@@ -42,6 +42,7 @@ def test_what_keeps_a_robot_off_is_said(robot, tmp_path):
     assert physics.why_library == "the model has nonlinear dampers"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", ["", ' damping="1.5"', ' damping="1.5 .01"'])
 def test_torques_beyond_the_limits_move_as_in_c_mujoco(robot, tmp_path, damping):
     """With dampers in the knees too, and with such as need mujoco-warp's own stages: on 20 steps, through contacts."""
@@ -66,6 +67,7 @@ def test_torques_beyond_the_limits_move_as_in_c_mujoco(robot, tmp_path, damping)
 ALONG = {"half cheetah": ("half_cheetah.xml", 0.01, 1.0), "humanoid": ("humanoid.xml", 0.003, 0.4)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALONG)
 def test_every_step_of_a_rollout_is_that_of_c_mujoco(name, device):
     """Each of 100 states that a rollout of C MuJoCo under random controls passes, through contacts and limits, is a world
@@ -130,6 +132,7 @@ def difference(model: mujoco.MjModel, worlds: int, steps: int, seed: int, device
     return max(relative_error(found[name][i], getattr(data, name)) for name in found for i, data in enumerate(datas))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FREELY)
 def test_a_hundred_steps_without_contacts_are_those_of_c_mujoco(name, device):
     model = FREELY[name]()
@@ -146,6 +149,7 @@ def test_random_trees_move_as_in_c_mujoco(joints, passive, device):
         assert difference(model, worlds=3, steps=100, seed=seed, device=device) < 1e-4, seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passive", [False, True])
 def test_random_trees_are_held_by_their_limits_as_in_c_mujoco(passive, device):
     """One step of 20 worlds of each of three trees, of which most are beyond some limit."""

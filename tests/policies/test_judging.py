@@ -175,6 +175,7 @@ def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys
     assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "bias", "says"),
     [

@@ -3,6 +3,8 @@
 import signal
 import sys
 
+import pytest
+
 from legged.process.processes import BUILT, Job, Kind, WorkerPool, why_failed
 from legged.process.startup import STAGES_FILE
 
@@ -36,6 +38,7 @@ def test_as_many_run_side_by_side_as_there_is_room_for(tmp_path):
     assert noted.index("c begins") > min(noted.index("a ends"), noted.index("b ends"))
 
 
+@pytest.mark.slow
 def test_a_training_begins_when_the_one_before_it_is_built(tmp_path):
     jobs = [script(Kind.TRAINING, name, tmp_path / "log", built_after=0.2, lasts=1.0) for name in "abc"]
     noted = ran(jobs, {Kind.TRAINING: 2})
@@ -44,6 +47,7 @@ def test_a_training_begins_when_the_one_before_it_is_built(tmp_path):
     assert not list(tmp_path.glob("*.stages"))
 
 
+@pytest.mark.slow
 def test_what_shares_the_device_waits_for_all_trainings_and_the_rest_does_not(tmp_path):
     log = tmp_path / "log"
     after = script(Kind.ON_GPU, "gpu", log)

@@ -63,6 +63,7 @@ def test_pattern_that_names_nothing_is_an_error(shapes, pattern):
         shapes.contacts([pattern], "where")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
 def test_forces_and_places_of_feet_of_several_shapes(engine):
     """H1 thrown on the ground, 10 steps, beside C MuJoCo, whose contacts are added up by hand."""
