@@ -27,18 +27,26 @@ UNLIKE = ["observations.critic=[dof_pos, base_lin_vel]", "observations.actor_his
 NO_MIRROR = "train.algorithm.symmetry=false"
 RECURRENT = ["train.policy.rnn_hidden_dim=6", "train.algorithm.num_mini_batches=2", NO_MIRROR]
 VARIANTS = {
-    "sizes": ["train.policy.actor_hidden_dims=[16, 8, 4]", "train.policy.activation=tanh"],
-    "shared observations": ["train.policy.critic_observations=[actor]", *UNLIKE],
-    "several groups": [
+    "sizes, sgd": [
+        "train.policy.actor_hidden_dims=[16, 8, 4]",
+        "train.policy.activation=tanh",
+        "train.algorithm.optimizer=sgd",
+        "train.algorithm.normalize_advantage_per_mini_batch=true",
+    ],
+    "shared observations, bounded std": [
+        "train.policy.critic_observations=[actor]",
+        *(f"train.policy.{name}" for name in ("init_noise_std=0.5", "min_noise_std=0.499", "max_noise_std=0.501")),
+        *UNLIKE,
+    ],
+    "several groups, log std": [
         "train.policy.actor_observations=[critic, actor]",
         "train.policy.critic_observations=[actor, critic]",
+        "train.policy.noise_std_type=log",
+        "train.policy.min_noise_std=0.3",
         "train.policy.obs_normalization=true",
         *UNLIKE,
     ],
-    "bounded std": [f"train.policy.{name}" for name in ("init_noise_std=0.5", "min_noise_std=0.499", "max_noise_std=0.501")],
-    "log std": ["train.policy.noise_std_type=log", "train.policy.min_noise_std=0.3", "train.policy.obs_normalization=true"],
     "std by state": ["train.policy.state_dependent_std=true", "train.policy.noise_std_type=log"],
-    "sgd": ["train.algorithm.optimizer=sgd", "train.algorithm.normalize_advantage_per_mini_batch=true"],
     "estimator": [
         "train.policy.estimator.targets=[base_lin_vel]",
         "train.policy.estimator.hidden_dims=[8]",
@@ -125,7 +133,7 @@ def test_every_kind_of_network_is_trained_resumed_played_evaluated_and_exported(
 @pytest.mark.slow
 def test_terms_of_several_groups_lie_where_their_description_says():
     """48 numbers twice after 15: the newest of the actor's dof_pos begins at 15 + 48 + 12."""
-    folder = tiny_run(*VARIANTS["several groups"])
+    folder = tiny_run(*VARIANTS["several groups, log std"])
     assert call(play.main, [*BASE, "--load_run", str(folder), "--num_envs", "1", "--no-video"]) == 0
     facts = json.loads((folder / "exported" / "policy.json").read_text())
     assert facts["observation_groups"] == [
@@ -301,8 +309,7 @@ def test_what_the_captured_loop_cannot_hold_trains_on_rsl_rls_and_says_why(chang
 @pytest.mark.parametrize(
     "changes",
     [
-        VARIANTS["several groups"],
-        VARIANTS["log std"],
+        VARIANTS["several groups, log std"],
         VARIANTS["estimator"],
         ["train.algorithm.normalize_advantage_per_mini_batch=true"],
     ],

@@ -16,16 +16,17 @@ pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 EVENTFUL = ["env.episode_length_s=0.3", "commands.resampling_time_s=0.1", "domain_rand.push_interval_s=0.06"]
 """Episodes, commands and pushes that end, change and come within a few iterations of four steps."""
 VARIANTS = {
-    "curriculum of commands": ["commands.curriculum.window_s=0.02", "commands.curriculum.threshold=0.0"],
-    "stock": ["--runner", "stock"],
-    "normalised, rmsprop": ["train.policy.obs_normalization=true", "train.algorithm.optimizer=rmsprop"],
+    "curriculum of commands, normalised, rmsprop": [
+        *("commands.curriculum.window_s=0.02", "commands.curriculum.threshold=0.0"),
+        *("train.policy.obs_normalization=true", "train.algorithm.optimizer=rmsprop"),
+    ],
+    "stock, std by state": ["--runner", "stock", "train.policy.state_dependent_std=true"],
     "terrain, torques from velocities": ["--task", "anymal_c", "control.control_type=V"],
     "history": ["--task", "anymal_c_proprio"],
     "estimator, bounds of the std": [
         *("--task", "anymal_c_estimator", "train.policy.estimator.latent=2"),
         *("train.policy.min_noise_std=0.498", "train.policy.noise_std_type=log"),
     ],
-    "std by state": ["train.policy.state_dependent_std=true"],
     "lstm": ["train.policy.rnn_type=lstm", "train.policy.rnn_hidden_dim=6", "train.algorithm.symmetry=false"],
     "gru, forces": [
         *("train.policy.rnn_type=gru", "train.policy.rnn_num_layers=2", "train.algorithm.symmetry=false"),
