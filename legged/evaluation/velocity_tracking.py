@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,40 +76,53 @@ def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, An
     all physics steps. `contact_overflows` counts robots times steps that lost contacts because memory was full; `estimates`
     holds the errors of a policy with an estimator.
     """
+    network = getattr(act, "network", None)
+    estimated = EstimationErrors(task.observation_groups[ESTIMATED]) if isinstance(network, EstimatingModel) else None
+
+    def read(observations: TensorDict) -> dict[str, Tensor]:
+        if estimated is None:
+            return _now(task)
+        estimates = network.estimate(observations)  # type: ignore[union-attr]
+        return {**_now(task), "estimates": estimated.squares(estimates, observations[ESTIMATED])}
+
     commands = torch.tensor(grid.cells, dtype=torch.float32, device=torch.device(task.device))
-    sums = {name: torch.zeros_like(value) for name, value in _now(task).items()}
-    estimates = EstimateMeter(task, act)
-
-    def add(observations: TensorDict, alive: Tensor) -> None:
-        for name, value in _now(task).items():
-            sums[name] += torch.where(alive if value.dim() == 1 else alive.unsqueeze(1), value, 0.0)
-        estimates.add(observations, alive)
-
-    fell, lost = hold(task, act, commands.repeat_interleave(grid.robots, dim=0), grid.settle_s, grid.hold_s, add)
+    commands = commands.repeat_interleave(grid.robots, dim=0)
+    sums, fell, lost = hold(task, act, commands, grid.settle_s, grid.hold_s, read)
     measured_s = (round(grid.hold_s / task.dt) - round(grid.settle_s / task.dt)) * task.dt
-    return {**_summary(task, grid, sums, fell, measured_s), **estimates.found(), "contact_overflows": lost}
+    found = _summary(task, grid, sums, fell, measured_s)
+    if estimated is not None:
+        found["estimates"] = estimation_errors(type(task), estimated.names, sums["estimates"], sums["steps"])
+    return {**found, "contact_overflows": lost}
 
 
 @torch.inference_mode()
 def hold(
-    task: LeggedRobot, act: Policy, commands: Tensor, settle_s: float, hold_s: float, add: Callable[[Any, Tensor], None]
-) -> tuple[Tensor, int]:
-    """Let robots follow constant commands (N, 3) for `hold_s` [s]; after each step that follows the first `settle_s`, call
-    `add` with the observations and the flags (N,) of the robots that are in their first episode still. Return the flags of
-    those that fell in it, and how often a robot lost contacts.
+    task: LeggedRobot,
+    act: Policy,
+    commands: Tensor,
+    settle_s: float,
+    hold_s: float,
+    read: Callable[[TensorDict], dict[str, Tensor]],
+) -> tuple[dict[str, Tensor], Tensor, int]:
+    """Let robots follow constant commands (N, 3) for `hold_s` [s], and read quantities (N, ...) from the observations and the
+    task after each step that follows the first `settle_s`. Return their sums over the steps of each robot's first episode,
+    with the number of these `steps` (N,); the flags (N,) of the robots that fell in it; and how often a robot lost contacts.
     """
     task.reset()
     observations = task.hold_commands(commands)
     alive = torch.ones(task.num_envs, dtype=torch.bool, device=commands.device)
     fell, overflows = torch.zeros_like(alive), Overflows()
-    for step in range(round(hold_s / task.dt)):
+    sums: dict[str, Tensor] = {}
+    for step in range(max(1, round(hold_s / task.dt))):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
         fell |= alive & task.terminated_buf
         alive &= ~task.reset_buf
         if step >= round(settle_s / task.dt):
-            add(observations, alive)
-    return fell, overflows.total(task)
+            for name, value in {"steps": alive.float(), **read(observations)}.items():
+                counted = torch.where(alive if value.dim() == 1 else alive.unsqueeze(1), value, 0.0)
+                sums[name] = sums[name] + counted if name in sums else counted
+    return sums, fell, overflows.total(task)
 
 
 def _now(task: LeggedRobot) -> dict[str, Tensor]:
@@ -117,7 +130,6 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
     power = task.torques * task.dof_vel
     collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
     return {
-        "steps": torch.ones(task.num_envs, device=power.device),
         "lin": velocity_error(task.commands, task.base_lin_vel),
         "ang": yaw_rate_error(task.commands, task.base_ang_vel),
         "power": power.abs().sum(dim=1),
@@ -179,36 +191,16 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
     }
 
 
-class EstimateMeter:
-    """Sums of the squared errors of a policy's estimates; empty for a policy without an estimator."""
-
-    def __init__(self, task: BaseTask, act: Policy) -> None:
-        """Measure the policy `act`, if it is an `Actor` with an estimator."""
-        self._task, self._network = task, getattr(act, "network", None)
-        if isinstance(self._network, EstimatingModel):
-            self._errors = EstimationErrors(task.observation_groups[ESTIMATED])
-            self._squares = torch.zeros(task.num_envs, len(self._errors.names), device=torch.device(task.device))
-            self._counted = torch.zeros(task.num_envs, device=self._squares.device)
-
-    def add(self, observations: TensorDict, counted: Tensor) -> None:
-        """Add the errors of the estimates from `observations` for the robots in `counted` (N,)."""
-        if isinstance(self._network, EstimatingModel):
-            squares = self._errors.squares(self._network.estimate(observations), observations[ESTIMATED])
-            self._squares += torch.where(counted.unsqueeze(1), squares, 0.0)
-            self._counted += counted
-
-    def found(self) -> dict[str, Any]:
-        """Return `estimates`: the root mean square error of each term over robots and steps, with its unit; null if no step
-        was counted. Return nothing for a policy without an estimator.
-        """
-        if not isinstance(self._network, EstimatingModel):
-            return {}
-        count, found = float(self._counted.double().sum()), {}
-        means = (self._squares.double().sum(dim=0) / max(count, 1.0)).tolist()
-        for name, mean in zip(self._errors.names, means, strict=True):
-            unit = unit_of(getattr(type(self._task), f"_obs_{name}"))
-            found[name] = {"rmse": math.sqrt(mean) if count else None, "unit": unit}
-        return {"estimates": found}
+def estimation_errors(
+    kind: type[BaseTask], names: Sequence[str], squares: Tensor, steps: Tensor
+) -> dict[str, dict[str, Any]]:
+    """Return the root mean square error of each estimated term, with its unit, from the sums of squares (N, terms) over the
+    `steps` (N,) of each robot; null without a step.
+    """
+    count = float(steps.double().sum())
+    means = (squares.double().sum(dim=0) / max(count, 1.0)).tolist()
+    errors = {name: math.sqrt(mean) if count else None for name, mean in zip(names, means, strict=True)}
+    return {name: {"rmse": error, "unit": unit_of(getattr(kind, f"_obs_{name}"))} for name, error in errors.items()}
 
 
 def print_tracking(result: dict[str, Any]) -> None:

@@ -15,9 +15,9 @@ from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import RunError
-from legged.evaluation import following, result_file, velocity_tracking
+from legged.evaluation import following, result_file
 from legged.evaluation.velocity_grid import Grid, axes_of, axis_values
-from legged.evaluation.velocity_tracking import draw_tracking, measure_tracking, print_tracking
+from legged.evaluation.velocity_tracking import draw_tracking, hold, measure_tracking, print_tracking
 from legged.play import demonstrations
 from legged.policies.restore import TrainedPolicy, undisturbed
 from legged.registry import task_config
@@ -112,15 +112,16 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
     json.dumps(result, allow_nan=False)
 
 
-def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen(monkeypatch):
+def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen():
     """Its time is up at the end of step 15, so that of 30 steps those from 10 to 13 are of its first episode."""
-    counted = []
-    monkeypatch.setattr(velocity_tracking.EstimateMeter, "add", lambda *given: counted.append(given[-1].tolist()))
+    task = make_task(override(small_config(), [*undisturbed(2, 0.6), ("env.episode_length_s", 0.3)]))
+    sums, fell, lost = hold(task, stand, torch.tensor([[0.5, 0.0, 0.0]] * 2), 0.2, 0.6, lambda _: {"ones": torch.ones(2, 3)})
+    assert sums["steps"].tolist() == [4.0, 4.0]
+    assert sums["ones"].tolist() == [[4.0] * 3] * 2
+    assert not fell.any()
+    assert lost == 0
     grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.6, settle_s=0.2)
-    result = on_grid(grid, stand, ("env.episode_length_s", 0.3))
-    assert counted == [[True] * 2] * 4 + [[False] * 2] * 16
-    assert result["falls"] == 0.0
-    assert result["cells"][0]["rmse_lin"] == pytest.approx(0.5, abs=0.2)
+    assert on_grid(grid, stand, ("env.episode_length_s", 0.3))["cells"][0]["rmse_lin"] == pytest.approx(0.5, abs=0.2)
 
 
 def test_a_cell_in_which_nobody_was_measured_has_no_gait_either(capsys):

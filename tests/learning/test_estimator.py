@@ -18,7 +18,8 @@ from test_resume import content, same
 from legged.cli import train
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import read_scalars
-from legged.evaluation.velocity_tracking import EstimateMeter
+from legged.evaluation.velocity_grid import Grid
+from legged.evaluation.velocity_tracking import estimation_errors, measure_tracking
 from legged.graph.step_graph import ForbidHostReads
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint
@@ -27,6 +28,7 @@ from legged.learning.ppo import DevicePPO
 from legged.learning.rollout import Rollout
 from legged.learning.runner import Runner
 from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.policies.actor import Actor
 from legged.policies.export import export
 
 pytestmark = pytest.mark.usefixtures("workplace")
@@ -239,13 +241,23 @@ def test_it_is_evaluated_in_the_unit_of_the_term():
             parameter.zero_()
     observations = runner.env.get_observations()
     observations["estimated"] = 2.0 * torch.tensor([[0.3, 0.0, 0.0], [0.0, 0.4, 0.0], [5.0, 5.0, 5.0]])
-    act = type("Acts", (), {"network": runner.alg.actor})()
-    meter = EstimateMeter(runner.env, act)
-    assert meter.found() == {"estimates": {"base_lin_vel": {"rmse": None, "unit": "m/s"}}}
+    errors, counted = EstimationErrors(runner.env.observation_groups["estimated"]), torch.tensor([1.0, 1.0, 0.0])
     with torch.no_grad():
-        meter.add(observations, torch.tensor([True, True, False]))
-    assert meter.found()["estimates"]["base_lin_vel"]["rmse"] == pytest.approx((0.25 / 6.0) ** 0.5)
-    assert EstimateMeter(small_task(), lambda seen: seen["actor"]).found() == {}
+        squares = errors.squares(runner.alg.actor.estimate(observations), observations["estimated"]) * counted[:, None]
+    found = estimation_errors(type(runner.env), errors.names, squares, counted)
+    assert found == {"base_lin_vel": {"rmse": pytest.approx((0.25 / 6.0) ** 0.5), "unit": "m/s"}}
+    none = estimation_errors(type(runner.env), errors.names, 0.0 * squares, 0.0 * counted)
+    assert none == {"base_lin_vel": {"rmse": None, "unit": "m/s"}}
+
+
+@pytest.mark.slow
+def test_an_evaluation_on_the_grid_holds_its_errors():
+    grid = Grid([0.5], [0.0], [0.0], robots=2, hold_s=0.1, settle_s=0.04)
+    task, other = small_task(*SMALL, num_envs=2), small_task(num_envs=2)
+    estimates = measure_tracking(task, Actor(task, "cpu"), grid)["estimates"]
+    assert estimates.keys() == {"base_lin_vel"}
+    assert estimates["base_lin_vel"]["rmse"] > 0.0
+    assert "estimates" not in measure_tracking(other, Actor(other, "cpu"), grid)
 
 
 # ---- files -----------------------------------------------------------------------------------------------------------

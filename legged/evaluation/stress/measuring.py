@@ -209,15 +209,13 @@ class Bench:
         """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
         before the measurement began, and flags of those that fell (N,).
         """
-        total, steps = (torch.zeros(task.num_envs, device=task.device) for _ in range(2))
 
-        def add(_: TensorDict, alive: Tensor) -> None:
-            total.add_(torch.where(alive, velocity_error(task.commands, task.base_lin_vel), 0.0))
-            steps.add_(alive)
+        def read(_: TensorDict) -> dict[str, Tensor]:
+            return {"error": velocity_error(task.commands, task.base_lin_vel)}
 
-        fell, lost = hold(task, act, commands.to(task.device), SETTLE_S, HOLD_S, add)
+        sums, fell, lost = hold(task, act, commands.to(task.device), SETTLE_S, HOLD_S, read)
         self.lost += lost
-        return (total / steps).cpu(), fell.cpu()
+        return (sums["error"] / sums["steps"]).cpu(), fell.cpu()
 
 
 def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
