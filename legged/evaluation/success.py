@@ -79,7 +79,7 @@ TYPES_HELP = (
     " training by default"
 )
 
-OPEN, REACHED, FELL, STUCK = range(4)
+REACHED, FELL, STUCK = range(3)
 """Outcomes of a robot."""
 PANELS = {
     "stairs": ("stairs_up", "stairs_down"),
@@ -99,33 +99,28 @@ class Scores:
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
         """Take robots that stand at `start` (N, 2 or more), world frame [m], and have to get `distance` away [m]."""
         self._start, self._distance = start[:, :2].clone(), distance
-        self.outcome = torch.full((len(start),), OPEN, device=start.device)
-        """(N,) OPEN, REACHED, FELL or STUCK."""
-        self.time_s = torch.zeros(len(start), device=start.device)
+        self._open = torch.ones(len(start), dtype=torch.bool, device=start.device)
+        self.outcome = torch.full((len(start),), STUCK, device=start.device)
+        """(N,) REACHED, FELL, or STUCK, which robots without an event are too."""
+        self.time_s = torch.full((len(start),), TIME_S, device=start.device)
         """(N,) time of the event [s]."""
 
     def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor) -> None:
         """Update the outcomes after a control step that ends at `time_s` [s]: bases at (N, 3), failures (N,), time-outs of
         the task (N,).
         """
-        waiting = self.outcome == OPEN
         # A robot whose episode ended in this step is back at its start already, so its position does not count.
-        reached = waiting & ~(terminated | timed_out) & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
-        self.time_s.masked_fill_(reached | (waiting & (terminated | timed_out)), time_s)
-        self.outcome.masked_fill_(waiting & timed_out, STUCK)
-        self.outcome.masked_fill_(waiting & terminated, FELL)
+        ended = terminated | timed_out
+        reached = self._open & ~ended & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
         self.outcome.masked_fill_(reached, REACHED)
-
-    def finish(self) -> None:
-        """Mark the robots without an event as stuck."""
-        waiting = self.outcome == OPEN
-        self.outcome.masked_fill_(waiting, STUCK)
-        self.time_s.masked_fill_(waiting, TIME_S)
+        self.outcome.masked_fill_(self._open & terminated, FELL)
+        self.time_s.masked_fill_(reached | (self._open & ended), time_s)
+        self._open &= ~(reached | ended)
 
     @property
     def done(self) -> bool:
-        """True if every robot has an outcome."""
-        return not bool((self.outcome == OPEN).any())
+        """True if every robot had its event."""
+        return not bool(self._open.any())
 
 
 # ---- sizes and tiles --------------------------------------------------------------------------------------------------
@@ -226,7 +221,6 @@ def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
         scores.update(step * task.dt, task.base_pos, task.terminated_buf, task.time_out_buf)
         if scores.done:
             break
-    scores.finish()
     return scores, overflows.total(task)
 
 

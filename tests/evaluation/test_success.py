@@ -15,7 +15,6 @@ from legged.evaluation.intervals import wilson
 from legged.evaluation.measurement import Setting
 from legged.evaluation.success import (
     FELL,
-    OPEN,
     REACHED,
     STUCK,
     Scores,
@@ -78,17 +77,17 @@ def test_the_first_event_counts():
         terminated[list(fell)] = True
         scores.update(time_s, position, terminated, torch.zeros_like(terminated))
 
-    assert scores.outcome.tolist() == [OPEN] * 6
     at(1.0, [3.9, 3.0, 3.9, 0.0, 0.0, 3.99])
-    assert scores.outcome.tolist() == [OPEN] * 6
+    assert scores.outcome.tolist() == [STUCK] * 6
+    assert scores.time_s.tolist() == [20.0] * 6
     at(2.0, [4.0, 0.0, 3.9, 0.0, -4.1, 3.99], fell=[1])  # robot 1 falls at 3 m and is put back to its start
     at(3.0, [0.0, 4.5, 3.9, 4.2, 0.0, 3.99], fell=[0, 3])  # 0 falls after its success; 3 in the step in which it would be one
     at(4.0, [0.0, 4.5, 3.9, 4.5, 0.0, 3.99])  # 1 and 3 wander off after their falls
-    assert scores.outcome.tolist() == [REACHED, FELL, OPEN, FELL, REACHED, OPEN]
     assert not scores.done
-    scores.finish()
     assert scores.outcome.tolist() == [REACHED, FELL, STUCK, FELL, REACHED, STUCK]
     assert scores.time_s.tolist() == [2.0, 2.0, 20.0, 3.0, 2.0, 20.0]
+    at(5.0, [4.0] * 6)
+    assert scores.outcome.tolist() == [REACHED, FELL, REACHED, FELL, REACHED, REACHED]
     assert scores.done
 
 
@@ -106,7 +105,7 @@ def test_height_is_no_distance():
     scores = Scores(torch.zeros(1, 3))
     no = torch.zeros(1, dtype=torch.bool)
     scores.update(1.0, torch.tensor([[2.0, 2.0, -5.0]]), no, no)
-    assert scores.outcome.tolist() == [OPEN]
+    assert scores.outcome.tolist() == [STUCK]
     scores.update(2.0, torch.tensor([[2.9, 2.9, 0.0]]), no, no)  # 4.1 m along the diagonal
     assert scores.outcome.tolist() == [REACHED]
 
