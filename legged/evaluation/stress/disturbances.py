@@ -3,7 +3,7 @@ robot, all in one simulation.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -23,6 +23,16 @@ from legged.terrain import Terrain
 WRITTEN_FOR = "anymal_c"
 """Robot for which the numbers below are written. They are scaled for other robots."""
 
+PUSH_INTERVAL = 5.0
+"""Time between two pushes of a robot [s]."""
+
+
+def _told(text: str, unit: str = "", default: float | None = 0.0) -> Any:
+    """Return a field of a disturbance: the text of its number, and the unit of a number that scales with the robot; delays,
+    angles and shares do not scale.
+    """
+    return field(default=default, metadata={"text": text, "unit": unit})
+
 
 @dataclass(frozen=True)
 class Disturbance:
@@ -31,56 +41,40 @@ class Disturbance:
     """
 
     name: str
-    payload: float = 0.0
+    payload: float = _told("{:g} kg on the base", "kg")
     """Mass added to the base, at its centre of mass [kg]."""
-    friction: float | None = None
+    friction: float | None = _told("friction {:g}", default=None)
     """Sliding friction of all contacts of the robot, in place of its nominal one [1]."""
-    motors: float = 1.0
+    motors: float = _told("motors at {:.0%}", default=1.0)
     """Factor on the torque of every motor and on its limit [1]."""
-    delay: float = 0.0
+    delay: float = _told("targets {:g} s late")
     """Delay of the targets on the way to the motors [s]."""
-    push: float = 0.0
+    push: float = _told(f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s", "m/s")
     """Every PUSH_INTERVAL the base's velocity along the world's x and y is set to random values up to this, either way [m/s].
     """
-    zero_offset: float = 0.0
+    zero_offset: float = _told("encoders up to {:g} rad off")
     """Largest random error of the encoders, either way; policy and motors both use the wrong angle [rad]."""
-    tilt: float = 0.0
+    tilt: float = _told("inertial sensor askew by {:g} rad")
     """Tilt of the inertial sensor about a random horizontal axis [rad]."""
-    map_height: float = 0.0
+    map_height: float = _told("height map {:g} m too high or low", "m")
     """Vertical error of the height map, either way [m]."""
-    map_shift: float = 0.0
+    map_shift: float = _told("height map shifted by {:g} m", "m")
     """Horizontal error of the height map, in a random direction [m]."""
-    map_holes: float = 0.0
+    map_holes: float = _told("{:.0%} of the height map missing")
     """Share of the points of the height map that are missing and read 0, like level ground [1]."""
 
     @property
     def changes(self) -> dict[str, float]:
-        """Return field -> number of the fields that differ from their defaults."""
+        """Return name -> number of the fields that differ from their defaults."""
         return {one.name: getattr(self, one.name) for one in fields(self)[1:] if getattr(self, one.name) != one.default}
 
     @property
     def text(self) -> str:
         """Return the disturbances as text, in physical units."""
-        return ", ".join(TEXTS[name].format(value) for name, value in self.changes.items()) or "nothing"
+        told = {one.name: one.metadata["text"] for one in fields(self)[1:]}
+        return ", ".join(told[name].format(value) for name, value in self.changes.items()) or "nothing"
 
 
-PUSH_INTERVAL = 5.0
-"""Time between two pushes of a robot [s]."""
-TEXTS = {
-    "payload": "{:g} kg on the base",
-    "friction": "friction {:g}",
-    "motors": "motors at {:.0%}",
-    "delay": "targets {:g} s late",
-    "push": f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s",
-    "zero_offset": "encoders up to {:g} rad off",
-    "tilt": "inertial sensor askew by {:g} rad",
-    "map_height": "height map {:g} m too high or low",
-    "map_shift": "height map shifted by {:g} m",
-    "map_holes": "{:.0%} of the height map missing",
-}
-"""Field -> text of its number."""
-UNITS = {"payload": "kg", "push": "m/s", "map_height": "m", "map_shift": "m"}
-"""Fields that scale with the robot, and their units; delays, angles and shares do not scale."""
 GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
 """Properties (domain_rand.ranges) that rows set."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
@@ -124,14 +118,16 @@ def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Dist
 def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
     """Return the disturbance `one`, scaled from the size `anymal` to `robot`."""
     grow: dict[str, Any] = {
-        name: float(f"{getattr(one, name) * grown(unit, anymal, robot):.2g}") for name, unit in UNITS.items()
+        of.name: float(f"{getattr(one, of.name) * grown(of.metadata['unit'], anymal, robot):.2g}")
+        for of in fields(one)[1:]
+        if of.metadata["unit"]
     }
     return replace(one, **grow)
 
 
 def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
     """Return the disturbances of all `parts`, which have no field in common."""
-    return Disturbance(name, **{field: value for part in parts for field, value in part.changes.items()})
+    return Disturbance(name, **{key: value for part in parts for key, value in part.changes.items()})
 
 
 # ---- the task --------------------------------------------------------------------------------------------------------
