@@ -18,21 +18,6 @@ from legged.evaluation.success import types_in
 TITLE = "Experiments"
 EMPTY = ("", "-")
 """Texts of empty cells; a column of empty cells is left out."""
-FORMS = {
-    "RMSE [m/s]": ".3f",
-    "yaw rate RMSE [rad/s]": ".3f",
-    "falls [%]": ".2f",
-    "stairs [m]": ".3f",
-    "return, evaluated": ".1f",
-    "terrain level": ".2f",
-    "return": ".2f",
-    "velocity error [m/s]": ".3f",
-    "steps [M]": ".1f",
-    "start-up [s]": ".1f",
-    "loop [s]": ".1f",
-    "steps/s": ",.0f",
-}
-"""Formats of the figures that are averaged in a row of several seeds."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
 """Share of robots above which stairs count as crossed."""
@@ -69,7 +54,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
     if len(rows) == 1:
         return rows[0]
     shared: dict[str, Cell] = dict(rows[0])
-    for name, form in FORMS.items():
+    for name, (_, form) in _figures(group[0], {}).items():
         known = [cell.value for row in rows if isinstance(cell := row[name], Number) and cell.value is not None]
         shared[name] = number(mean(known) if known else None, form)
     seeds = [seed for record in group if isinstance(seed := record.at("env.seed"), int)]
@@ -84,21 +69,6 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
     timing = record.timing
     by_engine = {result["physics"]: result for result in record.results}
     judged = by_engine[in_order(by_engine)[0]] if by_engine else {}
-    tracking = tracking_of(judged)
-    figures = {
-        "RMSE [m/s]": value_at(tracking, "rmse_lin.mean"),
-        "yaw rate RMSE [rad/s]": value_at(tracking, "rmse_ang.mean"),
-        "falls [%]": 100.0 * tracking["falls"] if "falls" in tracking else None,
-        "stairs [m]": highest_stairs(judged),
-        "return, evaluated": value_at(judged, "episodes.return.mean"),
-        "terrain level": _last(record, "Terrain/level"),
-        "return": _last(record, "Train/mean_reward"),
-        "velocity error [m/s]": _last(record, "Metrics/lin_vel_rmse"),
-        "steps [M]": timing.steps / 1e6 if timing else None,
-        "start-up [s]": timing.start_up_s if timing else None,
-        "loop [s]": timing.loop_s if timing else None,
-        "steps/s": timing.steps_per_s if timing else None,
-    }
     return {
         "began": _began(record, beside, ending),
         "task": record.task,
@@ -107,10 +77,31 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
         "iterations": number(record.done, ",.0f"),
         "seed": number(seed if isinstance(seed := record.at("env.seed"), int) else None, ",.0f"),
         "evaluated": record.another_policy(judged),
-        **{name: number(value, FORMS[name]) for name, value in figures.items()},
+        **{name: number(value, form) for name, (value, form) in _figures(record, judged).items()},
         "robots": number(record.robots, ",.0f"),
         "device": "" if timing is None else "CPU" if timing.device == "cpu" else timing.device,
         "commit": Mono(record.code.commit[:10] + ("+" if record.code.files else "")),
+    }
+
+
+def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | None, str]]:
+    """Return the figures that are averaged in a row of several seeds, each with its format: those of the evaluation `judged`,
+    the last ones of the training, and its times.
+    """
+    timing, tracking = record.timing, tracking_of(judged)
+    return {
+        "RMSE [m/s]": (value_at(tracking, "rmse_lin.mean"), ".3f"),
+        "yaw rate RMSE [rad/s]": (value_at(tracking, "rmse_ang.mean"), ".3f"),
+        "falls [%]": (100.0 * tracking["falls"] if "falls" in tracking else None, ".2f"),
+        "stairs [m]": (highest_stairs(judged), ".3f"),
+        "return, evaluated": (value_at(judged, "episodes.return.mean"), ".1f"),
+        "terrain level": (_last(record, "Terrain/level"), ".2f"),
+        "return": (_last(record, "Train/mean_reward"), ".2f"),
+        "velocity error [m/s]": (_last(record, "Metrics/lin_vel_rmse"), ".3f"),
+        "steps [M]": (timing.steps / 1e6 if timing else None, ".1f"),
+        "start-up [s]": (timing.start_up_s if timing else None, ".1f"),
+        "loop [s]": (timing.loop_s if timing else None, ".1f"),
+        "steps/s": (timing.steps_per_s if timing else None, ",.0f"),
     }
 
 
