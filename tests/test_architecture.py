@@ -61,7 +61,7 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only():
 FLOORS = [  # from the ground up; each part imports from the floors below it only
     {"errors", "math", "state"},
     {"process"},
-    {"graph", "config", "figures"},
+    {"graph", "config", "figures", "tables"},
     {"robots", "terrain"},
     {"physics"},
     {"mdp"},

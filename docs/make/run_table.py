@@ -11,9 +11,9 @@ from evaluated_run import EvaluatedRun
 from legged.errors import ConfigError
 from legged.evaluation.engines import ENGINES, engine_of
 from legged.evaluation.result_file import tracking_of
-from legged.evaluation.tables import markdown_table
 from legged.process.paths import relative
 from legged.robots.robot import load_robot
+from legged.tables import markdown_table
 
 UP, DOWN = "stairs_up", "stairs_down"
 NONE = "-"

@@ -15,13 +15,13 @@ from legged.evaluation.engines import ENGINES
 from legged.evaluation.measurement import Setting, warn_of_overflows
 from legged.evaluation.result_file import device_name, file_name, kept_parts, tracking_of, write_result
 from legged.evaluation.success import draw_success, print_success, success_over_difficulty, with_other_engines
-from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import Grid
 from legged.evaluation.velocity_tracking import draw_tracking, measure_tracking, print_tracking, ready_to_track
 from legged.figures import COLORS, figure
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
 from legged.process.paths import relative
+from legged.tables import screen_table
 from legged.terrain import BUMPS
 
 EVERYWHERE = "all"

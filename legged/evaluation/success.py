@@ -30,12 +30,12 @@ from legged.evaluation.json_forms import ANY, NUMBER, check_form
 from legged.evaluation.measurement import Overflows, Setting
 from legged.evaluation.reports.charts import Chart, Line, draw_charts
 from legged.evaluation.result_file import HEAD, POINT, TYPE, file_name
-from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import cell_for, on_terrain, tiles_of_sizes
 from legged.evaluation.velocity_grid import read_range, spaced
 from legged.math import uniform, yaw_of
 from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
+from legged.tables import screen_table
 from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_types, tile_size
 
 TILE = 8.0

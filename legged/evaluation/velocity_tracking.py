@@ -17,7 +17,6 @@ from legged.config.networks import ESTIMATED
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.marks import unit_of
 from legged.evaluation.measurement import Overflows, Setting
-from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import ROUGH_SPAWN, on_terrain, rough_ground, rough_side
 from legged.evaluation.velocity_grid import AXES, Grid, mean_and_worst, number_or_null
 from legged.figures import figure
@@ -26,6 +25,7 @@ from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.policies.actor import Actor
 from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
+from legged.tables import screen_table
 from legged.terrain import Terrain
 
 GRAVITY = 9.81

@@ -4,8 +4,7 @@ terrain, or, in tasks without commands, go through an episode.
 
 import numpy as np
 import torch
-from rich.markup import escape
-from rich.table import Column, Table
+from rich.table import Table
 from torch import Tensor
 
 from legged.envs import BaseTask, LeggedRobot
@@ -13,6 +12,7 @@ from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.play.films import Video
 from legged.play.playground import Playground
 from legged.policies.episodes import Policy, episodes_table, measure_episodes
+from legged.tables import screen_table
 
 SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
     (2.0, (0.5, 0.0, 0.0)),
@@ -70,7 +70,7 @@ def velocities(task: LeggedRobot, robots: slice) -> list[str]:
 @torch.inference_mode()
 def follow_schedule(task: LeggedRobot, act: Policy, video: Video) -> Table:
     """Run the schedule on all robots, filmed by `video`; return a table of errors and falls."""
-    table = _table("following commands", "vx, vy [m/s], yaw [rad/s]")
+    rows = []
     low, high = task.command_sampler.full_ranges.cpu().numpy().T
     task.reset()
     for seconds, wanted in SCHEDULE:
@@ -83,8 +83,8 @@ def follow_schedule(task: LeggedRobot, act: Policy, video: Video) -> Table:
             errors.add(task, settled & (step * task.dt >= SETTLE_S))
             if video.due(step):
                 video.take(*velocities(task, slice(None)))
-        table.add_row(", ".join(f"{value:g}" for value in command), *errors.row())
-    return table
+        rows.append([", ".join(f"{value:g}" for value in command), *errors.row()])
+    return screen_table("following commands", ("vx, vy [m/s], yaw [rad/s]", *TrackingErrors.COLUMNS), rows)
 
 
 @torch.inference_mode()
@@ -108,19 +108,14 @@ def walk_out(task: LeggedRobot, act: Policy, playground: Playground, video: Vide
             if video.due(step):
                 where = playground.label(task.terrain, task.base_pos[followed].tolist())
                 video.take(*velocities(task, slice(followed, followed + 1)), where, followed=followed)
-    table = _table(f"walking out at {speed:g} m/s, {EPISODES} times {EPISODE_S:g} s", "terrain", "robots")
+    rows = []
     kinds = [playground.rows[0][column].type for column in playground.columns(task.num_envs)]
     for kind, label in playground.labels().items():
         robots = errors.steps.new_tensor([own == kind for own in kinds], dtype=torch.bool)
         if robots.any():
-            table.add_row(escape(label), str(int(robots.sum())), *errors.row(robots))
-    return table
-
-
-def _table(title: str, first: str, *others: str) -> Table:
-    """Return an empty table of tracking errors, with columns before them, of which the first holds texts."""
-    numbers = [Column(name, justify="right") for name in (*others, *TrackingErrors.COLUMNS)]
-    return Table(Column(escape(first)), *numbers, title=title, title_justify="left")
+            rows.append([label, str(int(robots.sum())), *errors.row(robots)])
+    title = f"walking out at {speed:g} m/s, {EPISODES} times {EPISODE_S:g} s"
+    return screen_table(title, ("terrain", "robots", *TrackingErrors.COLUMNS), rows)
 
 
 def roll_out(task: BaseTask, act: Policy, video: Video) -> Table:

@@ -5,13 +5,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from rich.markup import escape
 from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask
 from legged.policies.restore import TrainedPolicy
+from legged.tables import screen_table
 
 Policy = Callable[[TensorDict], Tensor]
 """Observations -> actions (N, D)."""
@@ -86,15 +86,12 @@ def spread_of(values: list[float]) -> dict[str, float]:
 
 def episodes_table(episodes: dict[str, Any], title: str) -> Table:
     """Return one line for each measure: return, its terms, lengths, failures, metrics."""
-    table = Table(title=escape(f"{title}: {episodes['count']} episodes"), title_justify="left")
-    table.add_column("measure")
-    for name in ("mean", "standard deviation", "least", "greatest"):
-        table.add_column(name, justify="right")
-    for name, label in (("return", "return"), ("length", "episode length [steps]")):
-        table.add_row(escape(label), *(f"{episodes[name][key]:.1f}" for key in ("mean", "std", "min", "max")))
-    for name, value in episodes["terms"].items():
-        table.add_row(escape(f"return of {name}"), f"{value:.1f}")
-    table.add_row("episodes that ended in a failure", f"{100 * episodes['failures']:.1f} %")
-    for name, value in episodes["metrics"].items():
-        table.add_row(escape(name), f"{value:.3f}")
-    return table
+    rows = [
+        [label, *(f"{episodes[name][key]:.1f}" for key in ("mean", "std", "min", "max"))]
+        for name, label in (("return", "return"), ("length", "episode length [steps]"))
+    ]
+    rows += [[f"return of {name}", f"{value:.1f}"] for name, value in episodes["terms"].items()]
+    rows.append(["episodes that ended in a failure", f"{100 * episodes['failures']:.1f} %"])
+    rows += [[name, f"{value:.3f}"] for name, value in episodes["metrics"].items()]
+    heads = ("measure", "mean", "standard deviation", "least", "greatest")
+    return screen_table(f"{title}: {episodes['count']} episodes", heads, rows)

@@ -17,10 +17,10 @@ from legged.config.loader import merge, nest
 from legged.config.origins import Origins
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError, RunError
-from legged.evaluation.tables import markdown_table
 from legged.figures import DPI
 from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.sweeping.plan import Plan
+from legged.tables import markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

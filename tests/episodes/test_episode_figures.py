@@ -17,7 +17,7 @@ from legged.episodes.page import Panels, groups_of
 from legged.episodes.ranking import counts_text, figures_of, listing, order_of
 from legged.errors import ConfigError
 from legged.evaluation.reports.document import text_of
-from legged.evaluation.tables import markdown_table
+from legged.tables import markdown_table
 
 SETTLED = round(SETTLE_S / DT)
 

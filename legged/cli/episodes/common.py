@@ -14,9 +14,9 @@ from legged.episodes.ranking import COLUMNS, FELL, counts_text, figures_of, list
 from legged.episodes.recorder import MOST_EPISODES, Wish, roll_out
 from legged.episodes.stored import Episodes, load_config, write_parquet
 from legged.errors import ConfigError, suggest
-from legged.evaluation.tables import markdown_table, screen_table
 from legged.policies.restore import TrainedPolicy
 from legged.process.paths import relative, write_text
+from legged.tables import markdown_table, screen_table
 
 EPISODES, MOST_ROBOTS = 50, 256
 """Default number of episodes, and largest default number of robots for them."""

@@ -15,11 +15,11 @@ from legged.episodes.joint_statistics import joint_statistics, tables_of, write_
 from legged.episodes.recorder import check_wish
 from legged.episodes.stored import ABOUT, Episodes, load_episodes
 from legged.evaluation.reports.document import text_of
-from legged.evaluation.tables import screen_table
 from legged.policies.restore import policy_of
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, ready_to_write
 from legged.registry import import_tasks
+from legged.tables import screen_table
 
 
 def build_parser() -> CommandParser:

@@ -21,13 +21,13 @@ from legged.cli.evaluate.common import check_number
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
 from legged.evaluation.playback import SETTLING_S, follow, play
-from legged.evaluation.tables import screen_table
 from legged.evaluation.velocity_grid import AXES, AXIS, Grid, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
 from legged.process.command_parser import CommandParser
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
+from legged.tables import screen_table
 
 COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0))
 """Default commands: vx, vy [m/s], yaw rate [rad/s]."""

@@ -32,7 +32,7 @@ from legged.evaluation.reports.document import (
 from legged.evaluation.reports.record import Record, words
 from legged.evaluation.result_file import BROKEN, changes_text, falls_of, grid_text, has_tracking, tracking_of
 from legged.evaluation.success import success_chart, success_line, types_in
-from legged.evaluation.tables import screen_table
+from legged.tables import screen_table
 
 Key = tuple[str, str, str]
 """Task, engine, and conditions that differ from the policy's own or between evaluations."""

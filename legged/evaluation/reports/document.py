@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from legged.evaluation.reports import render
 from legged.evaluation.reports.charts import sheet
-from legged.evaluation.tables import markdown_table
 from legged.process.paths import write_text
+from legged.tables import markdown_table
 
 SHORT = 32
 """Letters of a cell that stay on one line."""

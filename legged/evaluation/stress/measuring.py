@@ -29,7 +29,6 @@ from legged.evaluation.stress.disturbances import (
     table,
 )
 from legged.evaluation.success import FORWARD, TIME_S, point, run_out, share_of, to_run_out
-from legged.evaluation.tables import screen_table
 from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.evaluation.velocity_grid import axes_of, number_or_null
 from legged.evaluation.velocity_tracking import hold
@@ -40,6 +39,7 @@ from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed
 from legged.process.paths import relative
 from legged.robots.similarity import size_of
+from legged.tables import screen_table
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 
 RISER = 0.17

@@ -17,7 +17,7 @@ def screen_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
 ) -> Table:
     """Return a table for the screen; columns in `left` hold texts, the others numbers. None in place of a row draws a
-    rule.
+    rule; a short row leaves its last cells empty.
     """
     table = Table(title=escape(title), title_justify="left")
     for i, head in enumerate(heads):
