@@ -8,7 +8,7 @@ import argparse
 import gc
 import signal
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -84,20 +84,16 @@ def _main(argv: list[str] | None) -> int:
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
     hurries = take_priority()  # before a robot's SDK starts threads, which inherit the priority
-    try:
+    with ExitStack() as opened:
+        opened.callback(operator.close)
         if args.robot in KINDS:
             robot: Interface = UnitreeRobot(args.robot, SdkWire(KINDS[args.robot], args.network, args.domain))
         else:
             robot = UdpRobot(args.robot.removeprefix("udp:"))
-        try:
-            operator.take()
-            program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
-        except BaseException:
-            robot.close()
-            raise
-    except BaseException:
-        operator.close()
-        raise
+        opened.callback(robot.close)
+        operator.take()
+        program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
+        opened.pop_all()  # the program closes them
     sys.setswitchinterval(SWITCH_S)
     hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
     tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")

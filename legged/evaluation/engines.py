@@ -29,6 +29,7 @@ def engine_of(name: str) -> Engine:
     return ENGINES.get(name, Engine(name))
 
 
-def in_order(names: Iterable[str]) -> list[str]:
-    """Return names of engines in the order of ENGINES, others last."""
-    return sorted(names, key=lambda name: [*ENGINES, name].index(name))
+def by_engine(results: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return engine -> its result, in the order of ENGINES, others last."""
+    found = {result["physics"]: result for result in results}
+    return {name: found[name] for name in sorted(found, key=lambda name: [*ENGINES, name].index(name))}

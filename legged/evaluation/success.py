@@ -24,7 +24,7 @@ from legged.config import LeggedConfig, override
 from legged.config.dotted import value_at
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
-from legged.evaluation.engines import ENGINES, engine_of, in_order
+from legged.evaluation.engines import ENGINES, by_engine, engine_of
 from legged.evaluation.intervals import wilson
 from legged.evaluation.json_forms import ANY, NUMBER, check_form
 from legged.evaluation.measurement import Overflows, Setting
@@ -321,16 +321,15 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
     """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
     checkpoint and were measured with the same fields changed.
     """
-    found = {result["physics"]: result}
+    found = [result]
     drawn = {"types": {ANY: {**TYPE, "points": [{**POINT, "low": NUMBER, "high": NUMBER}]}}, "robots_per_point": NUMBER}
-    for engine in ENGINES.keys() - found:
+    for engine in ENGINES.keys() - {result["physics"]}:
         with suppress(OSError, ValueError):  # no file of this package: nothing to show
             saved = json.loads(path.with_name(file_name(engine)).read_text(encoding="utf-8"))
             check_form(saved, {**HEAD, "success": drawn}, str(path))
-            same = all(saved.get(key) == result.get(key) for key in ("task", "checkpoint", "changes"))
-            if same and saved["physics"] == engine:
-                found[engine] = saved
-    return [found[engine] for engine in in_order(found)]
+            same = {**{key: result.get(key) for key in ("task", "checkpoint", "changes")}, "physics": engine}
+            found += [saved] if all(saved.get(key) == value for key, value in same.items()) else []
+    return list(by_engine(found).values())
 
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:

@@ -14,7 +14,7 @@ from rich.table import Table as ScreenTable
 
 from legged.config.dotted import differences, value_at
 from legged.errors import ConfigError, suggest
-from legged.evaluation.engines import engine_of, in_order
+from legged.evaluation.engines import by_engine, engine_of
 from legged.evaluation.intervals import Interval, bootstrap_mean, newcombe, normal_mean, welch, wilson
 from legged.evaluation.learning_curves import curves_of_runs, labels
 from legged.evaluation.reports.charts import Line, curves, draw_charts
@@ -72,13 +72,18 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
     """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of the first
     result of each group.
     """
-    grids = [grid_text(result) for result in results]
-    told = len(set(grids) - {""}) > 1
     groups: Evaluations = {}
-    for result, grid in zip(results, grids, strict=True):
-        conditions = ", ".join(text for text in (changes_text(result), grid if told else "") if text)
+    for result, differing in zip(results, conditions_of(results), strict=True):
+        conditions = ", ".join(filter(None, differing))
         groups.setdefault((result["task"], result["physics"], conditions), []).append(result)
     return groups
+
+
+def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, str]]:
+    """Return for each evaluation its changed fields and, if the grids of commands differ, its grid, as text."""
+    grids = [grid_text(result or {}) for result in results]
+    told = len(set(grids) - {""}) > 1
+    return [(changes_text(result or {}), grid if told else "") for result, grid in zip(results, grids, strict=True)]
 
 
 def spread(values: Sequence[float]) -> float:
@@ -232,16 +237,17 @@ def apart(names: Sequence[str]) -> tuple[str, list[str]]:
 
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
     """Return tables and drawings of the engines in which at least two runs were evaluated."""
-    by_engine = [{result["physics"]: result for result in record.results} for record in records]
     parts: list[Part] = []
-    for engine in in_order(dict.fromkeys(name for one in by_engine for name in one)):
-        results = [one.get(engine) for one in by_engine]
+    for engine in by_engine(result for record in records for result in record.results.values()):
+        results = [record.results.get(engine) for record in records]
         if sum(result is not None for result in results) < 2:
             continue
         parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
         parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
-        parts += [Paragraph(f"{name}: {text}.") for name, text in zip(names, conditions_of(results), strict=True) if text]
+        for name, (changed, grid) in zip(names, conditions_of(results), strict=True):
+            told = "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if grid else [])])
+            parts += [Paragraph(f"{name}: {told}.")] if told else []
         drawings = []
         entries = [(name, types_in(result or {})) for name, result in zip(names, results, strict=True)]
         for kind in dict.fromkeys(kind for _, one in entries for kind in one):
@@ -258,16 +264,6 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
         " A * marks differences whose interval excludes 0. A single command or episode has no interval."
     )
     return [*parts, Paragraph(text)]
-
-
-def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[str]:
-    """Return for each evaluation its changed fields, and its grid of commands if the grids differ."""
-    changes, grids = ([text(result or {}) for result in results] for text in (changes_text, grid_text))
-    told = len(set(grids) - {""}) > 1
-    return [
-        "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if told and grid else [])])
-        for changed, grid in zip(changes, grids, strict=True)
-    ]
 
 
 def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Table:

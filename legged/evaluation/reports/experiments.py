@@ -7,7 +7,6 @@ from statistics import mean
 from typing import Any
 
 from legged.config.dotted import value_at
-from legged.evaluation.engines import in_order
 from legged.evaluation.learning_curves import smooth
 from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, number, text_of
 from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
@@ -67,8 +66,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
     """Return the row of a run, by column; figures of evaluations are those in the first engine of ENGINES that has one."""
     timing = record.timing
-    by_engine = {result["physics"]: result for result in record.results}
-    judged = by_engine[in_order(by_engine)[0]] if by_engine else {}
+    judged = next(iter(record.results.values()), {})
     return {
         "began": _began(record, beside, ending),
         "task": record.task,

@@ -15,6 +15,7 @@ from legged.config import to_dict
 from legged.config.dotted import MISSING, differences, flat, value_at
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError
+from legged.evaluation.engines import by_engine
 from legged.evaluation.learning_curves import Log, Scalars, read_config, read_scalars
 from legged.evaluation.result_file import file_name, read_results
 from legged.learning.invocation import Invocation, read_invocation
@@ -70,8 +71,8 @@ class Record:
     began: datetime
     timing: Timing | None
     scalars: Scalars
-    results: tuple[dict[str, Any], ...]
-    """Evaluations, one for each engine."""
+    results: dict[str, dict[str, Any]]
+    """Engine -> its evaluation, in the order of ENGINES."""
     code: Code
     note: str
     """Note of the user."""
@@ -165,13 +166,13 @@ def read_record(folder: Path) -> Record:
     timing, given = known(read_timing), known(read_invocation)
     scalars = known(read_scalars, otherwise={}) if any(folder.glob("events.out.tfevents.*")) else {}
     files = sorted(folder.glob(file_name("*")))
-    results = [result for path in files for result in known(lambda one: read_results([one]), path, [])]
+    results = by_engine(result for path in files for result in known(lambda one: read_results([one]), path, []))
     logged = [int(steps[-1]) + 1 for tag, (steps, _) in scalars.items() if not tag.endswith("/time") and len(steps)]
     saved = [number + 1 for number, path in checkpoints(folder).items() if path.name != "model.pt"]
     done = max([*logged, *saved], default=timing.iterations if timing else 0)
     status, why = _status(folder, timing, value_at(config, "train.runner.max_iterations"), done, max(saved, default=0))
     return Record(
-        folder, config, _began(folder), timing, scalars, tuple(results), read_code(folder), read_note(folder),
+        folder, config, _began(folder), timing, scalars, results, read_code(folder), read_note(folder),
         status, why, done, tuple(problems), given,
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from legged.evaluation.engines import engine_of, in_order
+from legged.evaluation.engines import engine_of
 from legged.evaluation.intervals import wilson
 from legged.evaluation.learning_curves import curves_of_run, smooth, times_of
 from legged.evaluation.reports.charts import curves, heat_map
@@ -203,8 +203,7 @@ def _evaluations(record: Record) -> list[Part]:
     parts: list[Part] = [Heading("Evaluation")]
     if not record.results:
         return [*parts, Paragraph(f"None yet: `{command_on(record, 'evaluate')}`")]
-    by_engine = {result["physics"]: result for result in record.results}
-    results = [(engine_of(name).label, by_engine[name]) for name in in_order(by_engine)]
+    results = [(engine_of(name).label, result) for name, result in record.results.items()]
     for label, result in results:
         if file := record.another_policy(result):
             parts.append(Paragraph(f"In {label} it is of `{file}`, which is not the last policy."))

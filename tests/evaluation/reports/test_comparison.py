@@ -16,7 +16,7 @@ def parts_of(*results):
             Path(f"logs/task/{number}"),
             {"task": "task", "train": {"runner": {"run_name": f"run {number}"}}},
             datetime(2026, 1, 2, 3, 4, 5),
-            None, {}, ({"physics": "mujoco", **result},), Code(), "", "finished", "", 1, (),
+            None, {}, {"mujoco": {"physics": "mujoco", **result}}, Code(), "", "finished", "", 1, (),
         )
         for number, result in enumerate(results)
     ]  # fmt: skip
@@ -51,14 +51,14 @@ def test_other_conditions_are_told():
     grids = {"vx": [-1.0, 1.0], "vy": [0.0], "yaw": [0.0]}, {"vx": [0.5], "vy": [0.0], "yaw": [0.0]}
     first, second = ({"grid": grid} for grid in grids)
     changed = first | {"changes": {"terrain.scan": "own", "sim.dt": 0.002}}
-    wide, narrow = "on vx -1 to 1, vy 0, yaw 0 (2 commands)", "on vx 0.5, vy 0, yaw 0 (1 command)"
-    assert conditions_of([first, changed, None]) == ["", "made with sim.dt=0.002, terrain.scan=own", ""]
-    assert conditions_of([first, second, first]) == [wide, narrow, wide]
+    wide, narrow = "vx -1 to 1, vy 0, yaw 0 (2 commands)", "vx 0.5, vy 0, yaw 0 (1 command)"
+    assert conditions_of([first, changed, None]) == [("", ""), ("sim.dt=0.002, terrain.scan=own", ""), ("", "")]
+    assert conditions_of([first, second, first]) == [("", wide), ("", narrow), ("", wide)]
     said = [
         part.text for part in parts_of({**tracking(0.2), **first}, {**tracking(0.3), **second}) if isinstance(part, Paragraph)
     ]
-    assert f"run 0: {wide}." in said
-    assert f"run 1: {narrow}." in said
+    assert f"run 0: on {wide}." in said
+    assert f"run 1: on {narrow}." in said
 
 
 def test_each_line_of_success_has_the_end_of_its_own_training():

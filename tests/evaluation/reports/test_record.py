@@ -142,7 +142,7 @@ def test_what_is_damaged_is_named_and_fails_nothing():
     (folder / "events.out.tfevents.1").write_text("garbage")
     (folder / "config.yaml").write_text("task: nowhere\nenv: {num_robots: 3}\n")
     record = read_record(folder)
-    assert (record.task, record.timing, record.scalars, record.results) == ("nowhere", None, {}, ())
+    assert (record.task, record.timing, record.scalars, record.results) == ("nowhere", None, {}, {})
     problems = " ".join(record.problems)
     assert len(record.problems) == 4
     assert all(name in problems for name in ("config.yaml", TIMING_FILE, "evaluation_mujoco.json", "TensorBoard"))
