@@ -65,7 +65,8 @@ def test_rewards_are_means_over_a_fifth_of_a_second():
 
 def test_bars_cover_the_steps_in_which_a_foot_is_on_the_ground():
     on = [(1, 0), (1, 0), (0, 0), (0, 1), (1, 1)]
-    page = ElementTree.fromstring(gait_diagram(history_of([sample(0.1 * k, contacts=feet) for k, feet in enumerate(on)])))
+    found = history_of([sample(0.1 * k, contacts=feet) for k, feet in enumerate(on)]).curves()
+    page = ElementTree.fromstring(gait_diagram(("LF_FOOT", "RF_FOOT"), found["times"], found["contacts"], 0.1))
     assert [row.text for row in page.iter("span")] == ["LF", "RF"]
     bars = [[(float(bar.get("x")), float(bar.get("width"))) for bar in svg] for svg in page.iter("svg")]
     assert bars[0] == [pytest.approx((-0.5, 0.2)), pytest.approx((-0.1, 0.1))]  # start before now, and length [s]
@@ -76,11 +77,11 @@ def test_bars_cover_the_steps_in_which_a_foot_is_on_the_ground():
 def test_the_largest_reward_terms_have_curves_and_the_others_are_summed():
     terms = tuple(f"part_{i}" for i in range(9))
     history = history_of([sample(0.1 * k, rewards=np.arange(9.0)) for k in range(5)], terms)
-    names, curves = reward_curves(history)
+    names, curves = reward_curves(terms, history.curves()["rewards"])
     assert names == [*terms[3:], "3 others"]
     assert len(names) == LARGEST + 1
     assert [curve[-1] for curve in curves] == pytest.approx([3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 0.0 + 1.0 + 2.0])
-    few, _ = reward_curves(history_of([], terms[:7]))
+    few, _ = reward_curves(terms[:7], np.zeros((7, 0)))
     assert few == [*terms[:6], terms[6]]  # a single other term keeps its name
 
 

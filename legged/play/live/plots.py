@@ -94,7 +94,7 @@ class LivePlots:
         else:
             self._velocities = [self._chart("forward velocity [m/s]", (actual,), 90)]
         self._gait = server.gui.add_html("") if history.feet else None
-        self._names, _ = reward_curves(history)
+        self._names, _ = reward_curves(history.terms, history.curves()["rewards"])
         unit = "s" if history.per_second else "step"
         self._rewards = self._chart(f"reward terms [1/{unit}]", _reward_lines(self._names), 110, least=0.0)
 
@@ -126,13 +126,13 @@ class LivePlots:
         shown = slice(None, None, max(1, -(-len(history.rows) // MOST_POINTS)))
         found = history.curves()
         times, actual, commanded = found["times"], found["actual"], found["commanded"]
-        names, rewards = reward_curves(history)
+        names, rewards = reward_curves(history.terms, found["rewards"])
         with self._server.atomic():
             for axis, chart in enumerate(self._velocities):
                 curves = (commanded[axis], actual[axis]) if len(chart.series) > 2 else (actual[axis],)
                 chart.data = (times[shown], *(curve[shown] for curve in curves))
             if self._gait is not None:
-                self._gait.content = gait_diagram(history)
+                self._gait.content = gait_diagram(history.feet, times, found["contacts"], history.dt)
             if names != self._names:  # new series make the browser build the chart anew
                 self._names = names
                 self._rewards.series = ({"label": "time [s]"}, *_reward_lines(names))
@@ -149,29 +149,28 @@ def _reward_lines(names: Sequence[str]) -> Lines:
     return tuple(_line(name, COLORS[k]) if k < LARGEST else _line(name, OTHERS, DASH) for k, name in enumerate(names))
 
 
-def reward_curves(history: History) -> tuple[list[str], list[np.ndarray]]:
-    """Return the names and values (K,) of the LARGEST reward terms in a history, then those of the sum of the others."""
-    values = history.curves()["rewards"]
+def reward_curves(terms: Sequence[str], values: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
+    """Return the names and values (K,) of the LARGEST of some reward terms with `values` (terms, K), then those of the sum of
+    the others.
+    """
     sizes = np.abs(np.nan_to_num(values)).sum(axis=1)
     largest = sorted(np.argsort(-sizes, kind="stable")[:LARGEST].tolist())
-    others = [i for i in range(len(history.terms)) if i not in largest]
-    names, curves = [history.terms[i] for i in largest], [values[i] for i in largest]
+    others = [i for i in range(len(terms)) if i not in largest]
+    names, curves = [terms[i] for i in largest], [values[i] for i in largest]
     if others:
-        names.append(history.terms[others[0]] if len(others) == 1 else f"{len(others)} others")
+        names.append(terms[others[0]] if len(others) == 1 else f"{len(others)} others")
         curves.append(values[others].sum(axis=0))
     return names, curves
 
 
-def gait_diagram(history: History) -> str:
-    """Return HTML with one row per foot, whose bars are the times at which the foot is on the ground."""
-    found, rows = history.curves(), []
-    times = found["times"]
-    for name, contacts in zip(without_common_words(history.feet), found["contacts"], strict=True):
+def gait_diagram(feet: Sequence[str], times: np.ndarray, contacts: np.ndarray, dt: float) -> str:
+    """Return HTML with one row per foot, whose bars are the `times` (K,) [s] at which its row of `contacts` (F, K) is 1."""
+    rows = []
+    for name, own in zip(without_common_words(feet), contacts, strict=True):
         # The rows at which the foot comes down and leaves the ground; a row covers the `dt` before its time.
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], contacts > 0.5, [False]]).astype(int)))
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], own > 0.5, [False]]).astype(int)))
         bars = "".join(
-            f'<rect x="{times[a] - history.dt:.3f}" width="{times[b - 1] - times[a] + history.dt:.3f}" height="1"'
-            f' fill="{ACTUAL}"/>'
+            f'<rect x="{times[a] - dt:.3f}" width="{times[b - 1] - times[a] + dt:.3f}" height="1" fill="{ACTUAL}"/>'
             for a, b in edges.reshape(-1, 2)
         )
         # One unit of the drawing's width is a second, so the bars line up with the time axes of the charts.
