@@ -48,17 +48,13 @@ class Event(Enum):
 
 
 TRANSITIONS = {
-    (State.IDLE, Event.DAMPING): State.DAMPING,
-    (State.DAMPING, Event.IDLE): State.IDLE,
-    (State.DAMPING, Event.STAND): State.STAND,
-    (State.STAND, Event.DAMPING): State.DAMPING,
-    (State.STAND, Event.WALK): State.WALK,
-    (State.WALK, Event.STAND): State.STAND,
-    (State.WALK, Event.DAMPING): State.DAMPING,
-    (State.STOP, Event.DAMPING): State.DAMPING,
-    **{(state, Event.STOP): State.STOP for state in State},
+    State.IDLE: (Event.DAMPING, Event.STOP),
+    State.DAMPING: (Event.IDLE, Event.STAND, Event.STOP),
+    State.STAND: (Event.DAMPING, Event.WALK, Event.STOP),
+    State.WALK: (Event.STAND, Event.DAMPING, Event.STOP),
+    State.STOP: (Event.DAMPING, Event.STOP),
 }
-"""(state, event) -> the next state; all other pairs are refused."""
+"""State -> the events that lead to the state of their name; all others are refused."""
 MOVING = (State.STAND, State.WALK)
 """States in which the safety checks can stop the robot."""
 RAMP = np.array([1.0, 1.0, 2.0])

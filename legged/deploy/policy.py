@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-from legged.deploy.contract import Contract, Term, read_contract
+from legged.deploy.contract import Contract, read_contract
 from legged.deploy.interface import Reading
 from legged.errors import ConfigError
 
@@ -130,7 +130,9 @@ class Policy:
         for group, steps in zip(contract.groups, self._steps, strict=True):
             steps[:-1] = steps[1:]
             for term in group.terms:
-                value = values[term.name] if term.source is None else _from_source(term, reading.sources[term.source])
+                value = values[term.name] if term.source is None else reading.sources[term.source]
+                if term.source == "heights":
+                    value = np.clip(-value - term.offset, -term.limit, term.deepest)
                 begin = term.start - group.start
                 steps[-1, begin : begin + term.size] = term.scale * value
             np.clip(steps[-1], -contract.observation_clip, contract.observation_clip, out=steps[-1])
@@ -138,7 +140,3 @@ class Policy:
                 steps[:] = steps[-1]
         self._begins = False
         return np.concatenate([steps.ravel() for steps in self._steps]).astype(np.float32)
-
-
-def _from_source(term: Term, given: np.ndarray) -> np.ndarray:
-    return np.clip(-given - term.offset, -term.limit, term.deepest) if term.source == "heights" else given

@@ -158,10 +158,9 @@ class Program:
             self._halting_s = None
             self._say("walk: it walks on", now)
             return
-        following = TRANSITIONS.get((self.state, event))
-        if following is None:
+        if event not in TRANSITIONS[self.state]:
             self._say(f"refused: '{event.value}' leads nowhere from {self.state.value}", now)
-        elif following in MOVING and reason is not None:
+        elif State(event.value) in MOVING and reason is not None:
             self._say(f"refused: {event.value}: {reason}", now)
         elif event is Event.WALK and now - self._since < self._path_s:
             self._say(f"refused: walk: it stands up for {self._path_s:g} s first", now)
@@ -172,7 +171,7 @@ class Program:
                 self._halting_s = 0.0
                 self._say("walk: it halts, and then stands", now)
         else:
-            self._enter(following, now)
+            self._enter(State(event.value), now)
 
     def _crooked(self) -> str | None:
         """Return a message about the joint that is furthest from a standing pose; None if all are close to it."""

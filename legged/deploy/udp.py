@@ -80,17 +80,9 @@ def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
 
 def pack_facts(facts: RobotFacts) -> bytes:
     """Return the body of the answer to a greeting; null stands for no limit."""
-    return json.dumps(
-        {
-            "name": facts.name,
-            "joint_names": list(facts.joint_names),
-            "position_limits": [[x if np.isfinite(x) else None for x in pair] for pair in facts.position_limits.tolist()],
-            "velocity_limits": facts.velocity_limits.tolist(),
-            "torque_limits": facts.torque_limits.tolist(),
-            "imu_body": facts.imu_body,
-            "offers": sorted(facts.offers),
-        }
-    ).encode()
+    limits = [[x if np.isfinite(x) else None for x in pair] for pair in facts.position_limits.tolist()]
+    said = {**vars(facts), "position_limits": limits, "offers": sorted(facts.offers)}
+    return json.dumps(said, default=np.ndarray.tolist).encode()
 
 
 def unpack_facts(body: bytes) -> RobotFacts:

@@ -125,16 +125,13 @@ class Bench:
         self.rows = tuple(row for row in rows if self.whole or row.name in lines)
         """The lines of the table that are measured."""
         self.scale = self.cfg.terrain.scale
+        self.on_plane = self.cfg.terrain.mesh_type == "plane"
+        """True if the policy was trained on a plane; it is then measured on the flat only."""
         self.riser = round(RISER * self.scale, 3) if riser is None else riser
         self.limit = LIMIT * sqrt(self.scale)
         """Largest error of a robot that follows its command [m/s]."""
         self.lost = 0
         """Number of control steps in which a robot lost contacts because memory was full."""
-
-    @property
-    def on_plane(self) -> bool:
-        """True if the policy was trained on a plane; it is then measured on the flat only."""
-        return self.cfg.terrain.mesh_type == "plane"
 
     def measure(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
         """Return the figures of some lines of the table; `changes` choose a solver."""
