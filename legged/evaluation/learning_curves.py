@@ -21,32 +21,27 @@ MOST_PARTS = len(COLORS) - 1
 """Reward parts with their own colour; the smaller ones are summed."""
 EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
 """Beginnings of tags; `WATCHED` begins those of evaluations during training."""
-SINGLE = {
+SINGLE = ("Metrics/lin_vel_rmse", "Metrics/ang_vel_rmse", "Metrics/falls")
+CURRICULUM = ("Metrics/command_vx", "Metrics/command_vy", "Metrics/command_yaw")
+LEARNER = ("Policy/mean_std", "Loss/value", "Loss/behavior")
+NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
+TITLES = {
     "Metrics/lin_vel_rmse": ("velocity error [m/s]", 1.0),
     "Metrics/ang_vel_rmse": ("yaw rate error [rad/s]", 1.0),
     "Metrics/falls": ("episodes that end in a fall [%]", 100.0),
-}
-"""Tag -> title and factor of a chart."""
-CURRICULUM = {
     "Metrics/command_vx": ("largest commanded vx [m/s]", 1.0),
     "Metrics/command_vy": ("largest commanded vy [m/s]", 1.0),
     "Metrics/command_yaw": ("largest commanded yaw rate [rad/s]", 1.0),
-}
-"""Tag, title and factor of the ranges of a curriculum of commands."""
-LEARNER = {
     "Policy/mean_std": ("standard deviation of actions (noise)", 1.0),
     "Loss/value": ("loss of the value function", 1.0),
     "Loss/behavior": ("behaviour loss: student's actions against its teacher's", 1.0),
+    "Evaluation/lin_vel_rmse": ("evaluated: velocity RMSE [m/s]", 1.0),
+    "Evaluation/ang_vel_rmse": ("evaluated: yaw rate RMSE [rad/s]", 1.0),
+    "Evaluation/falls": ("evaluated: robots that fell [%]", 100.0),
+    "Evaluation/return": ("evaluated: return of an episode", 1.0),
+    "Evaluation/episode_length": ("evaluated: length of an episode [control steps]", 1.0),
 }
-NOT_OF_THE_TASK = (LENGTH, "Metrics/contact_overflows", "Metrics/non_finite_worlds")
-OF_EVALUATION = {
-    "lin_vel_rmse": ("velocity RMSE [m/s]", 1.0),
-    "ang_vel_rmse": ("yaw rate RMSE [rad/s]", 1.0),
-    "falls": ("robots that fell [%]", 100.0),
-    "return": ("return of an episode", 1.0),
-    "episode_length": ("length of an episode [control steps]", 1.0),
-}
-"""Titles and factors of figures of evaluations; other figures are metrics of the task."""
+"""Tag -> title and factor of its chart. Other tags of charts are metrics of the task, which are titled by their names."""
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values."""
 Scalars = dict[str, Curve]
@@ -186,19 +181,17 @@ def outcomes(runs: Named) -> list[Chart]:
         *_returns(runs),
         *_several(SINGLE, runs),
         *_one(LENGTH, f"length of an episode [{'control steps' if dt is None else 's'}]", runs, dt or 1.0),
-        *_several({tag: (_title(tag), 1.0) for tag in others}, runs),
+        *_several(others, runs),
     ]
 
 
 def _learner(runs: Named) -> list[Chart]:
     """Return charts of the curriculum of commands, of evaluations during training and of the optimiser."""
-    watched = {tag: OF_EVALUATION.get(tag.removeprefix(WATCHED), (_title(tag), 1.0)) for tag in _tags(runs, WATCHED)}
-    evaluated = {tag: (f"evaluated: {title}", factor) for tag, (title, factor) in watched.items()}
     wanted = {value_at(log.config, "train.algorithm.desired_kl") for _, log in runs} - {None}
     level = ("desired_kl", float(wanted.pop())) if len(wanted) == 1 else None
     return [
         *_several(CURRICULUM, runs),
-        *_several(evaluated, runs, exact=True, markers=True),
+        *_several(_tags(runs, WATCHED), runs, exact=True, markers=True),
         *_one("Loss/learning_rate", "learning rate", runs, exact=True, log=True),
         *_several(LEARNER, runs),
         *_one("Loss/kl", "divergence (KL) within an update [nat]", runs, level=level),
@@ -209,13 +202,11 @@ def _tags(runs: Named, beginning: str) -> list[str]:
     return list(dict.fromkeys(tag for _, log in runs for tag in log.scalars if tag.startswith(beginning)))
 
 
-def _title(tag: str) -> str:
-    return tag.partition("/")[2].replace("_", " ")
-
-
-def _several(quantities: dict[str, tuple[str, float]], runs: Named, **how: Any) -> list[Chart]:
-    """Return the charts of quantities, given as tag -> title and factor."""
-    return [chart for tag, (title, factor) in quantities.items() for chart in _one(tag, title, runs, factor, **how)]
+def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
+    """Return the charts of the quantities with these tags."""
+    names = {tag: "evaluated: " * tag.startswith(WATCHED) + tag.partition("/")[2].replace("_", " ") for tag in tags}
+    titles = {tag: TITLES.get(tag, (name, 1.0)) for tag, name in names.items()}
+    return [chart for tag, (title, factor) in titles.items() for chart in _one(tag, title, runs, factor, **how)]
 
 
 def _one(
