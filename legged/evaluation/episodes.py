@@ -46,29 +46,22 @@ def evaluate_episodes(setting: Setting, episodes: int) -> int:
     return 0
 
 
-def environment_of(task: str) -> str:
-    """Return the name of a task's environment in Gymnasium (`GYMNASIUM_ID` of its class).
-
-    Raises:
-        ConfigError: the task has no environment in Gymnasium.
-    """
-    found = getattr(task_class(task), "GYMNASIUM_ID", None)
-    if not isinstance(found, str):
-        raise ConfigError(f"POLICY: '{task}' is not a task of Gymnasium: {task_class(task).__name__} has no GYMNASIUM_ID")
-    return found
-
-
 def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
     """Export the policy into the folder of the result, run the exported TorchScript in Gymnasium's environment for `episodes`
     episodes with the seeds 0, 1, ..., print a table and write evaluation_gymnasium.json. Return the exit code.
 
     Raises:
-        ConfigError: Gymnasium has no such environment, or one with other observations or actions.
+        ConfigError: the task's class names no environment (`GYMNASIUM_ID`), or Gymnasium has no such environment, or one with
+            other observations or actions.
         RunError: Gymnasium fails, or a file can't be written.
     """
     start = time.perf_counter()
     setting = replace(setting, device=torch.device("cpu"))
-    name, exported = environment_of(setting.policy.cfg.task), setting.folder / EXPORTED
+    kind, exported = task_class(setting.policy.cfg.task), setting.folder / EXPORTED
+    name = getattr(kind, "GYMNASIUM_ID", None)
+    if not isinstance(name, str):
+        asked = setting.policy.cfg.task
+        raise ConfigError(f"POLICY: '{asked}' is not a task of Gymnasium: {kind.__name__} has no GYMNASIUM_ID")
     calm, changes = for_episodes(setting.policy, 1)
     task, act = restore(calm, [*changes, *setting.asked], setting.device, graph=False)
     export(task, act.network, exported, trained=setting.policy.cfg)

@@ -60,17 +60,13 @@ class Playground:
             columns = [kind for kind, share in shares.items() if share > 0.0]
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
 
-        def tile(kind: str, d: float) -> TileSpec:
-            """Return a tile of the training's size if that is fixed and no difficulty is given."""
-            fixed = difficulty is None
-            return TileSpec(
-                kind, tile_size(cfg.terrain, kind, d) if fixed else TERRAIN_TYPES[kind].sized(d, cfg.terrain.scale)
-            )
+        def size(kind: str, usual: float) -> float:
+            """Return the size of a tile; without a given difficulty it is the training's, if that is fixed."""
+            if difficulty is None:
+                return tile_size(cfg.terrain, kind, usual)
+            return TERRAIN_TYPES[kind].sized(difficulty, cfg.terrain.scale)
 
-        front, back = (
-            tuple(tile(kind, d) for kind in columns)
-            for d in (DIFFICULTIES if difficulty is None else (difficulty, difficulty))
-        )
+        front, back = (tuple(TileSpec(kind, size(kind, usual)) for kind in columns) for usual in DIFFICULTIES)
         return cls((front, back), tuple(order))
 
     def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
