@@ -9,7 +9,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -282,30 +282,25 @@ class UnitreeRobot(Interface):
         self._heard: list[Reading] = []
         self._mode_machine = 0
         self._first = threading.Event()
-        wire.listen(self._hear)
-        try:
-            self._meet(name)
-        except BaseException:  # Ctrl-C too
-            wire.close()
-            raise
+        with ExitStack() as opened:
+            opened.callback(wire.close)
+            wire.listen(self._hear)
+            if not self._first.wait(FIRST_STATE_S):
+                raise RunError(
+                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
+                )
+            if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
+                raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
+            wire.take_over()
+            opened.pop_all()
+        with self._lock:
+            del self._heard[:-1]  # only the newest state counts
         self._command = wire.new_command()
         self._written: float | None = None
         self._braked = False
         self._closing = threading.Event()
         self._repeater = threading.Thread(target=self._repeat, name="unitree-commands", daemon=True)
         self._repeater.start()
-
-    def _meet(self, name: str) -> None:
-        """Wait for the first state, check that it is from the robot `name`, and take over."""
-        if not self._first.wait(FIRST_STATE_S):
-            raise RunError(
-                f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
-            )
-        if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
-            raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
-        self._wire.take_over()
-        with self._lock:
-            del self._heard[:-1]  # only the newest state counts
 
     def _hear(self, state: Any) -> None:
         """Store the reading of a LowState_."""
