@@ -52,6 +52,7 @@ def test_no_file_is_too_long_to_read():
     assert not {path: count for path, count in lines.items() if count > LONGEST}
 
 
+@pytest.mark.slow
 def test_warp_is_known_to_the_physics_and_to_the_graph_only():
     outside = [path for path in FILES if not name_of(path).startswith("legged.physics")]
     assert not {name_of(path) for path in outside if uses(path, "mujoco_warp")}

@@ -48,6 +48,7 @@ def files(workplace, tmp_path, monkeypatch):
         del sys.modules[name]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("files")
 def test_the_class_that_was_ported_trains():
     (command,) = [text.strip() for language, text in fenced(PAGE) if not language and "trot" in text]

@@ -58,6 +58,7 @@ def prose(path: Path) -> list[tuple[int, str, bool]]:
     return [(number, line.partition(mark)[2].strip(), False) for number, line in lines if mark in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [*CODE, *HEADERS, *YAML, *PAGES], ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_sentences_name_their_subject(path):
     found = [

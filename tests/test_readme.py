@@ -28,6 +28,7 @@ TASKS = sorted(path.stem for path in (ROOT / "cfg").glob("*.yaml"))
 ROUGH = ROOT / "resources" / "policies" / "anymal_c"
 
 
+@pytest.mark.slow
 def test_the_example_task_trains_without_touching_the_package(tmp_path, monkeypatch):
     (code,) = re.findall(r"```python\n# slip.py\n(.*?)```", README, flags=re.DOTALL)
     path = tmp_path / "readme_tasks.py"

@@ -99,6 +99,7 @@ def test_nothing_is_fetched_from_elsewhere_and_all_links_lead_somewhere(site):
         assert not re.search(r"(@import|url\()\s*[\"']?(https?:)?//", path.read_text(encoding="utf-8")), path.name
 
 
+@pytest.mark.slow
 @needs_mkdocs
 def test_what_is_made_from_the_code_is_complete(site):
     said = {name: html.unescape((site / "reference" / f"{name}.html").read_text(encoding="utf-8")) for name in PAGES}
@@ -125,6 +126,7 @@ PAGES = {
 """Page of the reference -> an anchor that it must have."""
 
 
+@pytest.mark.slow
 @needs_mkdocs
 def test_a_field_is_shown_with_default_unit_bounds_and_meaning(site):
     text = " ".join(Reader(site / "reference" / "configuration.html").text)
@@ -147,6 +149,7 @@ def test_a_wrong_link_ends_the_build(tmp_path, page, fine):
     assert (build(tmp_path / "mkdocs.yml", tmp_path / "out").returncode == 0) == fine
 
 
+@pytest.mark.slow
 @needs_mkdocs
 @pytest.mark.parametrize(
     ("source", "place", "text", "expected"),

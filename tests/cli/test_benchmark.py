@@ -32,6 +32,7 @@ SMALL = ["--sim-device", "cpu", "--num-envs", "8", "sim.physics=mujoco", "sim.th
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
+@pytest.mark.slow
 def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):
     steps = ["--steps", "5", "--repeats", "3", "--iterations", "2", "--out", str(tmp_path / "times")]
     assert step.main(["anymal_c_flat", *SMALL, *steps]) == 0
@@ -52,6 +53,7 @@ def test_times_of_step_physics_and_iterations_are_written(tmp_path, capsys):
     assert not list(tmp_path.glob("logs*"))
 
 
+@pytest.mark.slow
 def test_mujoco_warps_own_step_is_timed_beside_ours():
     """Both move the robots; on the CPU too ours takes less."""
     task = make_task(small_config(("sim.physics", "mujoco_warp"), num_envs=8))
@@ -64,18 +66,21 @@ def test_mujoco_warps_own_step_is_timed_beside_ours():
     assert "own launches" not in report(task, result | {"build_s": 0.0})
 
 
+@pytest.mark.slow
 def test_why_a_step_is_mujoco_warps_own_is_said():
     task = make_task(small_config(("sim.physics", "mujoco_warp"), ("sim.step", "library"), num_envs=2))
     text = report(task, time_steps(task, 1, 1) | {"build_s": 0.0})
     assert "  mujoco-warp's own launches: sim.step=library\n" in text
 
 
+@pytest.mark.slow
 def test_a_policy_is_named(capsys):
     arguments = ["--policy", TASK, "--steps", "2", "--repeats", "1", "--iterations", "0"]
     assert step.main([TASK, *SMALL, *arguments]) == 0
     assert f"resources/policies/{TASK}/model.pt" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_robots_of_a_policy_are_where_it_moved_them():
     """Physics alone is timed in turns with their steps, and leaves no trace."""
     places = []
@@ -111,6 +116,7 @@ def test_iterations_are_counted_without_the_first(kind):
     assert times["note"] == ""
 
 
+@pytest.mark.slow
 def test_students_and_estimators_are_timed_as_they_are_trained():
     """Both loops for others; a student by its own runner, with its teacher's observations beside the task's."""
     plain, estimating = small_config(), small_config(("train.policy.estimator.targets", ["base_lin_vel"]))
@@ -229,6 +235,7 @@ def test_scale_sets_the_number_of_robots_itself(option, capsys):
     assert capsys.readouterr().err.startswith("error: --num-envs: --robots")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("option", "words"),
     [

@@ -28,6 +28,7 @@ def write(tmp_path, **changes):
     return tmp_path / "log.npz"
 
 
+@pytest.mark.slow
 def test_the_motor_that_was_simulated_is_found_within_5_percent(tmp_path):
     np.savez(tmp_path / "log.npz", **simulated_log(12.0, noise=0.2))
     drive = fit_drive(read_log(tmp_path / "log.npz"), longest_delay=0.02)
@@ -47,6 +48,7 @@ def test_a_peak_of_the_friction_that_the_log_does_not_show_is_not_invented(tmp_p
     assert re.search(r"friction: 1\.\d+ N m \(the log shows no more to break away\), viscous 0\.2", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_unknown_gains_are_found_too_with_the_viscous_friction_in_them(tmp_path):
     arrays = simulated_log(12.0, noise=0.1)
     np.savez(tmp_path / "log.npz", **{name: a for name, a in arrays.items() if name not in ("stiffness", "damping")})
@@ -269,6 +271,7 @@ def test_a_wrong_log_is_one_line(tmp_path, changes, said, capsys):
     assert told.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -287,6 +290,7 @@ def test_joints_with_drives_of_their_own_are_not_fitted_as_one(tmp_path, changes
     check_alike(read_log(write(tmp_path, stiffness=np.array([14.0, 99.0]), damping=None)), path)  # the gains are fitted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flags", "said"),
     [

@@ -128,6 +128,7 @@ def test_gains_may_be_given_and_joints_held(added):
     assert "joints are held as asked: arm at 1 rad" in out
 
 
+@pytest.mark.slow
 def test_a_lopsided_robot_learns_without_mirror_images(added):
     added(urdf().replace('xyz="0.2 0.1 0"', 'xyz="0.25 0.1 0"'), "--name", "fifth_toy")
     task = yaml.safe_load(Path("mine/fifth_toy_flat.yaml").read_text())
@@ -135,6 +136,7 @@ def test_a_lopsided_robot_learns_without_mirror_images(added):
     task_config(register_file("mine/fifth_toy_flat.yaml"), on_cpu=True)
 
 
+@pytest.mark.slow
 def test_a_default_pose_that_leans_to_a_side_has_no_mirror_images(added):
     """Left and right hips turn about x alike, so 0.1 rad on both sides spreads one leg and pulls the other one in."""
     added(urdf(), "--name", "leaning_toy")
@@ -180,6 +182,7 @@ def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_pa
     assert "end above the foot" not in out  # the rod was drawn back once already
 
 
+@pytest.mark.slow
 def test_a_robot_that_looks_along_y_is_turned(added):
     """Its left legs are at -x: a quarter turn clockwise brings them to +y."""
     places = {"fl": (-0.1, 0.2), "fr": (0.1, 0.2), "hl": (-0.1, -0.2), "hr": (0.1, -0.2)}
@@ -210,6 +213,7 @@ def test_meshes_are_copied_and_drawn(added, tmp_path):
     assert set(drawn) == set(range(1, 14)) - {i for i in range(1, 14) if model.body(i).name.endswith("_hip")}  # bare ones too
 
 
+@pytest.mark.slow
 def test_a_model_of_menagerie(added, tmp_path, monkeypatch, capsys):
     """Through its own package, from a folder that stands in for what it would download."""
     menagerie = pytest.importorskip("mujoco_menagerie")
@@ -257,11 +261,13 @@ def test_a_wrong_call_ends_with_one_line(tmp_path, capsys, arguments, message):
     assert not Path("mine").exists()
 
 
+@pytest.mark.slow
 def test_a_task_on_rough_ground_is_called_like_its_robot(added):
     added(urdf(), "--name", "rough_toy", "--extends", "base/quadruped_rough")
     assert yaml.safe_load(Path("mine/rough_toy.yaml").read_text())["extends"] == "base/quadruped_rough"
 
 
+@pytest.mark.slow
 def test_nothing_is_written_over_unless_asked(added, capsys):
     added(urdf(), "--name", "ninth_toy")
     assert call(add.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2

@@ -41,6 +41,7 @@ def test_the_stance_is_that_of_a_two_link_leg(added):
         np.testing.assert_allclose(data.geom(f"{leg}_foot").xpos[:2], [x, y], atol=0.005)
 
 
+@pytest.mark.slow
 def test_a_robot_that_can_not_stand_on_what_looks_like_its_feet_is_refused(tmp_path, capsys):
     """Thighs that only point backwards, at least 1.3 rad from down, and knees that hardly bend."""
     arms = (
@@ -56,6 +57,7 @@ def test_a_robot_that_can_not_stand_on_what_looks_like_its_feet_is_refused(tmp_p
     assert not Path("mine").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hind", "called"), [(("hl", "hr"), "robot with 3 legs"), (("hl", "hr", "ml", "mr"), "robot with 5 legs")]
 )
@@ -76,6 +78,7 @@ def test_any_number_of_legs_stands_as_four_do(added, hind, called):
     assert yaml.safe_load(Path(f"mine/{name}_flat.yaml").read_text())["extends"] == "base/quadruped_flat"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("low", "high", "left", "right"), [(-1.3, -0.5, -1.26, -1.26), (0.5, 2.7, -1.405, 1.405)])
 def test_legs_of_a_pair_keep_the_limits_of_both(added, low, high, left, right):
     """The right knee bends less than the left one, which wants -1.405 rad, or the other way; 0.05 of a range is kept free."""

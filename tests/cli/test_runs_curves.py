@@ -36,6 +36,7 @@ def test_runs_are_read_and_averaged_over_common_iterations(tmp_path):
     assert values == pytest.approx([3.0, 6.0])
 
 
+@pytest.mark.slow
 def test_levels_get_charts_of_their_own(tmp_path):
     write_run(tmp_path / "rough", 1.0)
     log = learning_curves.Log(learning_curves.read_scalars(tmp_path / "rough"), {"terrain": {"num_rows": 5}})

@@ -53,6 +53,7 @@ def test_an_evaluation_that_is_named_twice_is_one_seed(tmp_path, capsys):
     assert "C MuJoCo, 1 seed " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_panels_of_types_that_one_engine_has_not_seen_are_as_wide_as_the_others(tmp_path, capsys):
     """An empty line that is not clipped took the room of all panels; matplotlib said so, and drew them into corners."""
     there = evaluation(tmp_path / "evaluation_mujoco_warp.json", stairs={0.1: 1.0, 0.2: 0.9})

@@ -113,6 +113,7 @@ def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_page_elsewhere_leads_to_no_report():
     folder = write_run(STAMPS[0])
     assert report.main([str(folder)]) == 0
@@ -123,6 +124,7 @@ def test_a_page_elsewhere_leads_to_no_report():
     assert str(Path.cwd()) not in Path("docs/experiments.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_folder_of_several_and_one_inside_it_name_a_run_once():
     write_run(STAMPS[0])
     other = write_run(STAMPS[1], logs="elsewhere")
@@ -209,6 +211,7 @@ def figures(*folders: Path) -> dict[str, list[str]]:
     return {row[0]: list(row[1:]) for row in found.rows}
 
 
+@pytest.mark.slow
 def test_evaluations_have_intervals():
     """The second policy is worse by 0.02 m/s in every cell, so that the difference has no width. 2 and 14 of 80 robots fall:
     Wilson's intervals are 0.04676 -+ 0.03988 and 0.18989 -+ 0.08269, Newcombe's 0.15 - 0.0916 and 0.15 + 0.0992.

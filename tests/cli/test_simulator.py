@@ -172,6 +172,7 @@ def test_it_brakes_when_nobody_speaks_to_it_any_more(simulated):
     robot.close()
 
 
+@pytest.mark.slow
 def test_sources_come_every_fifth_state_at_any_time_step():
     """At 0.35 ms a state comes after 11 steps (4 ms are 11.4), and sources after 5 states, 19.25 ms; 20 ms are 57 steps."""
     server = Server(SimulatedRobot(load_robot("anymal_c"), None, SimConfig(dt=0.00035)))
@@ -213,6 +214,7 @@ def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monk
     assert len(shown.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_film_has_a_picture_for_each_pose(tmp_path):
     if off_screen_library() is None:
         pytest.skip("nothing draws off screen here")

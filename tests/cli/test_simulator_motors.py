@@ -126,6 +126,7 @@ def contract(tmp_path_factory):
     return read_contract(folder / "policy.json")
 
 
+@pytest.mark.slow
 def test_a_simulated_robot_has_the_motors_that_its_policy_was_trained_with(contract):
     cfg, counted = motors_config(ROBOT, contract, False, [], 0.002)
     assert (cfg.model, cfg.delay, cfg.stall_torque, counted) == ("dc_motor", (2, 4), DC["stall_torque"], DT)

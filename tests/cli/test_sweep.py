@@ -74,6 +74,7 @@ def states(trials: Trials) -> list[str]:
 # ---- what a file asks for --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -174,6 +175,7 @@ def test_a_process_is_dead_when_it_has_gone_or_has_been_silent_elsewhere():
     assert not is_dead(None, now), "it has just been begun"
 
 
+@pytest.mark.slow
 def test_no_more_trials_are_begun_than_are_wanted_whoever_asks():
     first, second = Trials(plan_of()), Trials(plan_of(), worker=1)
     taken = [first.next(), second.next(), first.next()]
@@ -188,6 +190,7 @@ def test_no_more_trials_are_begun_than_are_wanted_whoever_asks():
     assert second.done == 1
 
 
+@pytest.mark.slow
 def test_a_trial_of_a_dead_process_is_tried_again_once_with_its_settings():
     trials, others = Trials(plan_of()), Trials(plan_of())
     trial = trials.next()
@@ -296,6 +299,7 @@ def test_trials_are_ordinary_runs_and_the_report_names_the_best(capsys):
     assert f"best: trial {best.number}, last return: {best.value:.4g}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_trial_that_falls_behind_is_ended_and_keeps_its_run(monkeypatch):
     written(trials=1)
     monkeypatch.setattr("optuna.Trial.should_prune", lambda _: True)

@@ -41,6 +41,7 @@ AMONG = {
 }
 
 
+@pytest.mark.slow
 def test_of_processes_that_begin_at_once_one_makes_the_trial_of_the_own_settings():
     plan = plan_of(AMONG)
     assert plan.own["train.policy.actor_hidden_dims"] == [8]

@@ -60,6 +60,7 @@ def test_colours_by_height():
     np.testing.assert_allclose(color(np.array([-3.0, 0.0, 0.45, 0.9])), [LOW, MIDDLE, 0.5 * (MIDDLE + HIGH), HIGH])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

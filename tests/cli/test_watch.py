@@ -16,6 +16,7 @@ from legged.play.live.page import HOST, PORT, free_port, is_loopback, url
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flags", "said"),
     [

@@ -29,6 +29,7 @@ NEEDS_NOTHING = {"torch", "mujoco", "numpy", "yaml"}
 # ---- commands and their help -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_of_a_command_shows_two_examples_that_it_can_read(name, capsys):
     parser = load(name).build_parser()
@@ -73,6 +74,7 @@ def test_words_without_a_command_list_commands(capsys):
     assert [line.split()[1] for line in lines] == sub_commands("episodes")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["--help"], ["-h"], [], ["list"], ["list", "robots"]])
 def test_help_and_lists_import_nothing_heavy(words):
     command = [sys.executable, "-X", "importtime", "-m", "legged", *words]
@@ -190,6 +192,7 @@ def test_a_policy_is_named_in_all_ways(trained, monkeypatch, name, experiment):
     forget_modules_of(trained)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["exported/00001", "exported/00001/policy.onnx"])
 def test_an_exported_policy_is_named_by_its_folder_or_its_file(trained, monkeypatch, name):
     monkeypatch.chdir(trained)
@@ -220,6 +223,7 @@ def shown(capsys, *words: str):
     return from_dict(read_yaml(Path("shown.yaml")))
 
 
+@pytest.mark.slow
 def test_a_task_is_named_by_its_place_or_by_the_option_of_legged_gym(capsys):
     changes = ["env.num_envs=3", "env.seed=5"]
     wanted = shown(capsys, TASK, *changes)
@@ -248,6 +252,7 @@ def test_a_folder_with_an_equals_sign_is_no_override(trained, monkeypatch, tmp_p
     assert "rate=0.1/run has no checkpoint 7 (it has: 0)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_play_names_a_run_of_the_task_by_the_options_of_legged_gym(trained, monkeypatch, capsys):
     monkeypatch.chdir(trained)
     (run,) = [folder for folder in run_folders() if folder.parent.name == TASK]

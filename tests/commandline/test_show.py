@@ -84,6 +84,7 @@ def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
     assert joints[1] == ["LF_HAA", "hinge", "7:8", "6:7", "-0.72 to 0.49"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "expected"),
     [

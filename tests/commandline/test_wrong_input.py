@@ -89,6 +89,7 @@ def test_a_missing_task_and_an_unknown_flag(fails, main, name):
     fails(main, task("--nonsense"), "--nonsense")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("argument", "words"),
     [
@@ -141,6 +142,7 @@ def test_a_mistake_in_a_file_of_a_user_s_task(fails, tmp_path):
     fails(train.main, ["--import", "my_tasks.py", "mine"], "mine.yaml: rewards.scales.walk_nicely", "has no reward")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("main", [train.main, play.main, grid.main, step.main])
 @pytest.mark.parametrize(
     ("arguments", "words"),
@@ -166,6 +168,7 @@ def test_a_module_that_is_not_there(fails, module):
     fails(train.main, task("--import", module), "--import", module)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("main", [train.main, play.main, grid.main, step.main])
 @pytest.mark.parametrize("number", ["0", "-3", "some"])
 def test_a_number_of_robots_that_cannot_be(fails, run, main, number):
@@ -239,6 +242,7 @@ def test_a_run_that_is_not_there_names_those_that_are(fails, run, main, flag):
     fails(main, [name, flag], "POLICY", f"'{name}'", f"did you mean '{TASK}/{run.name}'?")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("main", "flag"), LOADING)
 def test_a_checkpoint_that_is_not_there_names_those_that_are(fails, run, main, flag):
     fails(main, task(flag, "--checkpoint", "7"), "--checkpoint", "no checkpoint 7", "(it has: 0)")
@@ -292,6 +296,7 @@ def test_a_checkpoint_of_another_observation_names_both_sizes(fails, run):
     assert "33" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("main", "flag"), LOADING[1:])
 def test_other_observations_at_play(fails, run, main, flag):
     err = fails(main, task(flag, SMALLER), "model_0.pt", "observations")
@@ -299,6 +304,7 @@ def test_other_observations_at_play(fails, run, main, flag):
     assert "33" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("network", ["actor", "critic"])
 def test_a_checkpoint_of_another_network_names_both_shapes(fails, run, network):
     sizes = [f"train.policy.{name}_hidden_dims={'[16]' if name == network else '[8]'}" for name in ("actor", "critic")]
@@ -382,6 +388,7 @@ FOUND_LATER = {"wrong shape", "constructor calls nobody"}
 """Mistakes that show when the line has been left."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", MISTAKES)
 def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_path, kind):
     method, words = MISTAKES[kind]

@@ -157,6 +157,7 @@ def test_a_list_must_not_be_endless():
         override(LeggedConfig(), [("train.policy.actor_hidden_dims", [8] * 65)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", ["experiment_name", "run_name"])
 @pytest.mark.parametrize("name", ["a/b", "a\\b", "..", ".hidden", "/abs", "a\nb", "a\x1b[31m", "x" * 101, " x", "\udcff"])
 def test_a_folder_s_name_is_a_plain_name(field, name):

@@ -159,6 +159,7 @@ def test_a_rescaled_term_without_a_unit_is_refused(kind, config, message):
         task_config("rescale_bare")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "config"),
     [

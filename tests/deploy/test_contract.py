@@ -49,6 +49,7 @@ def changed(folder, tmp_path, **changes):
     return path
 
 
+@pytest.mark.slow
 def test_the_contract_says_what_a_robot_must_know(contract, folder):
     robot = load_robot("anymal_c")
     assert contract.joint_names == robot.joint_names
@@ -175,6 +176,7 @@ def test_a_stronger_robot_fits(contract):
     contract.check_fits(replace(facts, torque_limits=2.0 * facts.torque_limits, velocity_limits=2.0 * facts.velocity_limits))
 
 
+@pytest.mark.slow
 def test_a_policy_that_needs_more_than_sensors_is_refused_by_the_name_of_the_observation(tmp_path):
     policy = Policy(exported(tmp_path, ("observations.actor", ["base_lin_vel", *PROPRIOCEPTION])))
     with pytest.raises(ConfigError, match=r"observation: 'still' has nothing that gives 'base_lin_vel', which no sensor"):
@@ -379,6 +381,7 @@ def test_it_needs_numpy_and_onnxruntime_alone(folder):
     assert done.stdout.split("\n")[:2] == ["90 torch is blocked", "[]"], done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_policy_that_estimates_a_velocity_needs_nothing_that_gives_it(tmp_path):
     """The estimator is within the network: the robot's program reads what it always does."""
     estimating = ("train.policy.estimator.targets", ["base_lin_vel"]), ("train.policy.estimator.hidden_dims", [8])

@@ -31,6 +31,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", [1.0, 4.0], ids=["standing up", "walking"])
 @pytest.mark.parametrize("reason", CHANGES)
 def test_what_it_reads_stops_it_and_it_says_why(stage, reason, moment):
@@ -234,6 +235,7 @@ def test_a_terminal_that_is_held_or_closed_holds_nothing_up():
     assert said == ["a", "b", "c"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("after", "says"),
     [(lambda reading: reading, ""), (spoil(sources=lambda _: {"base_lin_vel": np.zeros(2)}), " has 2 numbers, not 3")],

@@ -220,6 +220,7 @@ def test_the_time_of_day_may_be_set_while_packets_come(link, monkeypatch, second
         assert 0.0 <= time.perf_counter() - reading.received < HANG_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [(1.0, 1.1, 1.3), (0.0, 0.0, 0.0), (1000.0, 0.1, 0.3)], ids=["ticks", "none", "set back"])
 def test_a_source_is_kept_until_it_is_too_old_whatever_the_robots_clock_says(link, times, monkeypatch):
     robot, there = link

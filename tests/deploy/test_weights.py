@@ -120,6 +120,7 @@ def test_the_header_computes_what_the_onnx_file_does(variant, program, tmp_path)
     np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-5 * max(1.0, np.abs(wanted).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("data", "says"),
     [(b"", "is cut short"), (b"nonsense, and more of it", "is no policy.weights"), (None, "is cut short")],

@@ -24,6 +24,7 @@ def stepped(task: LeggedRobot, actions) -> Tensor:
     return task.dof_pos.clone()
 
 
+@pytest.mark.slow
 def test_actions_with_a_gradient_are_stepped_and_nothing_is_spoilt(task):
     expected = stepped(task, ACTIONS)
     network = torch.nn.Linear(48, 12)

@@ -208,6 +208,7 @@ def test_a_hook_with_the_mark_lets_terms_run_early():
 BUFFERS = ("terminated_buf", "time_out_buf", "reset_buf", "valid", "rew_buf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("buffer", BUFFERS)
 @pytest.mark.parametrize("kind", ["reward", "metric", "terminate"])
 def test_a_users_term_with_the_mark_that_reads_which_episodes_end_is_refused_at_the_start(kind, buffer):

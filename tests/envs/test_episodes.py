@@ -52,6 +52,7 @@ def test_an_episode_times_out_after_exactly_its_length_and_is_no_failure():
     assert ends == [(20, 1), (30, 0), (30, 2), (30, 3), (50, 1), (60, 0), (60, 2), (60, 3)]
 
 
+@pytest.mark.slow
 def test_a_fall_at_the_last_step_is_a_fall_and_no_time_out():
     task = standing(("env.episode_length_s", 0.6))
     task.episode_length_buf = torch.tensor([29, 29, 0, 0])

@@ -96,6 +96,7 @@ def test_a_bad_number_of_one_robot_is_counted_and_resets_that_robot_only(kind, v
     assert not any(name.startswith("Faults/") for name in logged(sound))
 
 
+@pytest.mark.slow
 def test_a_reward_that_is_no_number_counts_as_nothing():
     """Of the other terms of that robot it is told nothing: their sum stands."""
     task = broken_task(reward=NAN)
@@ -106,6 +107,7 @@ def test_a_reward_that_is_no_number_counts_as_nothing():
     assert rewards[2] == pytest.approx(float(task.rewards.sums[:, 2].sum()), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ["time", "reset"])
 def test_a_bad_reward_at_the_end_of_an_episode_does_not_end_the_next_one(ends):
     task = broken_task(reward=NAN)
@@ -154,6 +156,7 @@ def test_physics_that_diverges_but_stays_finite_is_reset_too(value, graph):
         assert not dones.any()
 
 
+@pytest.mark.slow
 def test_what_is_large_but_a_number_passes():
     task = broken_task(reward=0.9 * LARGEST / 0.02, obs=0.9 * LARGEST)
     task.reset()
@@ -164,6 +167,7 @@ def test_what_is_large_but_a_number_passes():
     assert not any(name.startswith("Faults/") for name in logged(task))
 
 
+@pytest.mark.slow
 def test_a_diverged_robot_is_not_promoted():
     """It is far from where it started, but did not walk there."""
     settings = [("env.num_envs", 6), ("sim.physics", "mujoco"), ("sim.threads", 1)]
@@ -193,6 +197,7 @@ def weights(alg) -> list[torch.Tensor]:
     return [*models, *moments]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [NAN, INF])
 @pytest.mark.parametrize("what", POISONS)
 @pytest.mark.parametrize("kind", [DevicePPO, PPO])
@@ -297,6 +302,7 @@ def test_training_that_goes_on_being_bad_ends_at_the_last_checkpoint(capsys, kin
     assert all(torch.isfinite(tensor).all() for tensor in saved.values())
 
 
+@pytest.mark.slow
 def test_a_time_step_that_blows_up_does_not_poison_the_weights():
     folder = tiny_run("sim.dt=0.02", "control.decimation=1", "train.algorithm.learning_rate=0.01", num_envs=64, iterations=15)
     saved = torch.load(folder / "model_14.pt", weights_only=True)

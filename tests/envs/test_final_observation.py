@@ -36,6 +36,7 @@ def test_rollouts_are_bit_for_bit_those_of_a_task_that_keeps_nothing(history):
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+@pytest.mark.slow
 def test_where_nothing_ends_it_is_what_the_task_shows():
     """No pushes and no new commands: observations, history included, and states are those after the step."""
     settings = ("observations.groups.actor.history", 3), ("observations.add_noise", True)
@@ -50,6 +51,7 @@ def test_where_nothing_ends_it_is_what_the_task_shows():
         assert torch.equal(kept.qvel, task.physics.qvel)
 
 
+@pytest.mark.slow
 def test_states_are_those_before_a_reset():
     task = small_task(("env.episode_length_s", 0.02))
     kept = keep_final_step(task)

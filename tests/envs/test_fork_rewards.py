@@ -193,6 +193,7 @@ def test_there_are_many_rewards():
     assert len(REWARDS) >= 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REWARDS)
 def test_a_reward_of_a_fork_gives_numbers(fork, name):
     last = fork.rewards.last[fork.rewards.names.index(name)]

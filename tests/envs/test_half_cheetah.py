@@ -40,6 +40,7 @@ def test_observations_and_rewards_are_those_of_gymnasium(theirs):
     assert info["reward_ctrl"] < 0.0
 
 
+@pytest.mark.slow
 def test_episodes_begin_as_gymnasium_s_do(theirs):
     """Positions evenly within 0.1 of the model's, velocities normal with deviation 0.1."""
     task = make(4000)

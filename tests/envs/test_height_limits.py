@@ -37,6 +37,7 @@ def test_low_ground_looks_no_deeper_than_the_limit_of_depth():
         torch.testing.assert_close(task.heights_seen(ground), torch.tensor([seen] * 2))
 
 
+@pytest.mark.slow
 def test_a_trained_policy_is_told_less_of_depth_than_in_training():
     """Wherever it acts: play, evaluation and export build their tasks by `nominal()`. What is asked for there comes first."""
 

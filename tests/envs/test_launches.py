@@ -41,6 +41,7 @@ def test_motors_and_sensors_with_all_their_errors_are_few_launches_more():
     assert 0 < launches_of("anymal_c", errors).total() - launches_of("anymal_c").total() <= 22
 
 
+@pytest.mark.slow
 def test_everything_random_is_few_launches_more():
     """All properties, kicks and two forces: at most 9, of which only the two of kicks and forces are in the step's main line;
     `draw` and what is drawn again in `reset_idx` run beside it.

@@ -83,6 +83,7 @@ def test_targets_of_joints_that_are_held_are_their_default_angles():
     torch.testing.assert_close(task.joint_pos_target - task.default_dof_pos, moved.expand(ROBOTS, JOINTS))
 
 
+@pytest.mark.slow
 def test_noise_is_that_of_the_actor_whoever_adds_it():
     """Sensors that are late add the noise of what they measure by themselves."""
     noisy = ("observations.add_noise", True)
@@ -199,6 +200,7 @@ def test_what_a_class_sets_itself_takes_the_place():
     assert fork.hip_indices.tolist() == [0, 3, 6, 9]
 
 
+@pytest.mark.slow
 def test_what_is_kept_is_that_of_the_step_before():
     class Fork(LeggedRobot):
         def _reward_lin_vel_z(self):

@@ -148,6 +148,7 @@ def test_a_hook_of_another_kind_is_found_too(kind):
         subclass(_get_heights=kind(hook)).check(small_config())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own", [("_get_heights",), ["_get_heights"], "_get_heights"])
 def test_a_helper_of_that_name_which_the_class_calls_itself_is_allowed(own):
     class Mine(LeggedRobot):
@@ -214,6 +215,7 @@ def with_term(member: object, prefix: str = "_reward_") -> None:
     subclass(**{f"{prefix}mine": member}, MIRRORED=mirrored).check(cfg)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("member", "text"),
     [
@@ -235,6 +237,7 @@ def test_a_term_that_cannot_be_called_is_refused(member, text, prefix, path):
         with_term(member, prefix)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "member",
     [

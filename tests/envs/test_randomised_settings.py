@@ -79,6 +79,7 @@ def test_forces_are_observed_as_shares_of_the_largest():
     assert task._obs_push_force()[0].tolist() == pytest.approx([0.0, 0.5, 0.0, *task._obs_push_force()[0, 3:].tolist()])
 
 
+@pytest.mark.slow
 def test_privileged_observations_have_mirror_images():
     """Left and right joints change places, what points to the left changes its sign, and numbers of the whole robot stay."""
     ranges = {"friction": [0.4, 1.2], "base_com_y": [-0.1, 0.1], "motor_strength": {"range": [0.8, 1.1], "each": True}}
@@ -98,6 +99,7 @@ def test_privileged_observations_have_mirror_images():
 # ---- what is refused -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "draw", "error"),
     [
@@ -125,6 +127,7 @@ def test_mistakes_are_named(name, draw, error):
         small_config((f"domain_rand.ranges.{name}", draw))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "error"),
     [
@@ -172,6 +175,7 @@ def test_what_leans_to_a_side_may_be_observed_without_mirror_images_and_drawn_wi
     small_config(with_ranges(base_com_x=[0.0, 0.1]), observing("rand_base_com_x"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "name", "each", "words"),
     [

@@ -59,12 +59,14 @@ def forces_of(task):
     return torch.tensor(bound[:, 6:]).float()
 
 
+@pytest.mark.slow
 def test_a_motor_of_strength_0_8_gives_0_8_of_the_torque():
     task = small_task(with_ranges(motor_strength=[0.8, 0.8]), num_envs=2)
     task.physics.ctrl[:] = torch.linspace(-30.0, 30.0, 12)
     torch.testing.assert_close(forces_of(task), 0.8 * torch.linspace(-30.0, 30.0, 12).expand(2, -1))
 
 
+@pytest.mark.slow
 def test_a_torque_limit_of_a_half_halves_it_in_the_law_and_in_the_engine():
     task = small_task(with_ranges(torque_limit=[0.5, 0.5]), num_envs=2)
     limits = torch.as_tensor(task.robot.torque_limits, dtype=torch.float32)
@@ -75,6 +77,7 @@ def test_a_torque_limit_of_a_half_halves_it_in_the_law_and_in_the_engine():
     torch.testing.assert_close(forces_of(task), 0.5 * limits.expand(2, -1))
 
 
+@pytest.mark.slow
 def test_gains_are_factors_on_those_of_the_law():
     """At 0.1 rad from the target and 2 rad/s: 1.5 * kp * 0.1 - 0.5 * kd * 2."""
     plain = small_task(num_envs=1).control
@@ -118,6 +121,7 @@ def test_velocity_limits_are_those_that_rewards_know():
     torch.testing.assert_close(task._reward_dof_vel_limits(), torch.full((2,), 12 * 0.25), atol=1e-3, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_a_kick_adds_to_the_velocity_and_comes_at_its_time():
     """Every 0.1 s, which is 5 control steps: 0.5 m/s more sideways at once."""
     kick = {"interval_s": [0.1, 0.1], "y": [0.5, 0.5]}
@@ -175,6 +179,7 @@ def test_a_force_acts_for_its_duration_and_accelerates_by_f_over_m():
     assert moved[0].item() == pytest.approx(0.02**2 * (1 + 2 + 3 + 4 + 5), rel=0.05)  # semi-implicit Euler, 1 m/s^2
 
 
+@pytest.mark.slow
 def test_a_force_ends_with_the_episode():
     force = {"interval_s": [0.02, 0.02], "duration_s": [10.0, 10.0], "x": [5.0, 5.0]}
     task = after(small_task(("domain_rand.forces", {"f": force}), num_envs=2), 5)
@@ -186,6 +191,7 @@ def test_a_force_ends_with_the_episode():
 # ---- when ----------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_only_robots_that_are_reset_draw_again_and_the_start_is_kept():
     ranges = {name: draw for name, draw in EVERYTHING.items() if isinstance(draw, list) or draw["when"] == "reset"}
     task = small_task(("domain_rand.ranges", ranges), num_envs=4)
@@ -221,6 +227,7 @@ def test_what_is_drawn_is_what_the_engine_has():
         torch.testing.assert_close(torch.tensor(own.dof_invweight0), torch.tensor(kept[1]))
 
 
+@pytest.mark.slow
 def test_intervals_draw_each_robot_at_its_own_moments():
     """Every 0.1 s, which is 5 control steps."""
     draw = {"range": [-1.0, 1.0], "when": "interval", "interval_s": 0.1}
@@ -337,6 +344,7 @@ def test_every_field_is_among_those_that_are_drawn_here():
     assert set(EVERYTHING) == set(FIELDS)
 
 
+@pytest.mark.slow
 def test_a_force_does_not_go_on_into_episodes_that_begin_outside_of_a_step():
     """It lasts for 5 s; `reset()` ends it before, and the next step, too short for another one, is free of it."""
     force = {"x": [100.0, 200.0], "interval_s": [0.02, 0.04], "duration_s": [5.0, 5.0]}
@@ -352,6 +360,7 @@ def test_a_force_does_not_go_on_into_episodes_that_begin_outside_of_a_step():
     assert not task.physics.forces.any()
 
 
+@pytest.mark.slow
 def test_what_grows_begins_with_nothing_also_where_its_range_leaves_out_0():
     """Halfway from iteration 100 to 200 it is half of what is drawn: 0.25 to 0.5 m/s, -150 to -100 N."""
     steps = 24

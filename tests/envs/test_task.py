@@ -63,6 +63,7 @@ def test_the_observation_is_legged_gym_s_48_numbers_in_its_order():
     assert observations["actor"][:, 9:12].abs().sum() > 0  # somebody is asked to move
 
 
+@pytest.mark.slow
 def test_only_the_actor_sees_noise():
     task = small_task(("observations.add_noise", True), num_envs=64)
     observations, *_ = task.step(zero_actions(task))
@@ -80,6 +81,7 @@ def test_actions_are_clipped_before_they_are_used_or_seen():
     assert (observations["actor"][:, 36:] == -1.5).all()
 
 
+@pytest.mark.slow
 def test_the_first_observation_of_an_episode_shows_the_new_base_and_the_new_joints():
     task = small_task(("env.episode_length_s", 0.2))
     task.reset()
@@ -100,6 +102,7 @@ def test_the_first_observation_of_an_episode_shows_the_new_base_and_the_new_join
 # ---- rewards ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rewards_are_judged_on_the_command_that_the_policy_saw():
     scales = {name: 0.0 for name in small_config().rewards.scales} | {"tracking_lin_vel": 1.0}
     settings = [(f"rewards.scales.{name}", scale) for name, scale in scales.items()]
@@ -120,6 +123,7 @@ def test_rewards_are_judged_on_the_command_that_the_policy_saw():
 # ---- what rsl-rl is given --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_a_step_returns_is_not_changed_by_the_next():
     task = small_task(("env.episode_length_s", 0.1))
     static = {buffer.data_ptr() for buffer in (task.rew_buf, task.reset_buf, task.time_out_buf)}
@@ -191,6 +195,7 @@ def test_observing_neither_steps_nor_resets():
     assert first["actor"].data_ptr() != again["actor"].data_ptr()
 
 
+@pytest.mark.slow
 def test_the_log_comes_once_a_rollout_with_tensors_of_its_own():
     task = small_task(("train.runner.num_steps_per_env", 6), ("env.episode_length_s", 0.1))
     logs = {}
@@ -285,6 +290,7 @@ def register(monkeypatch):
 BASE = {"extends": "anymal_c_flat", "env": {"num_envs": 2}, "sim": {"physics": "mujoco", "threads": 1}}
 
 
+@pytest.mark.slow
 def test_a_subclass_with_terms_of_its_own_is_registered_from_outside(register):
     config = {
         **BASE,

@@ -104,6 +104,7 @@ def test_who_asked_for_an_engine_that_cannot_is_named():
         make_task(cfg)
 
 
+@pytest.mark.slow
 def test_a_policy_is_measured_on_the_nominal_model_unless_told_otherwise(tmp_path):
     cfg = small_config(*((f"domain_rand.ranges.{name}", [0.9, 1.1]) for name in ("friction", "link_mass")))
     folder = data_folder("resources") / "policies" / TASK
@@ -131,6 +132,7 @@ def test_a_term_ends_episodes_in_one_way_only():
         small_config(("terminations.time_outs", ["contact"]))
 
 
+@pytest.mark.slow
 def test_an_own_limit_is_kept_where_ours_is_off():
     own = {"_terminate_tilt": lambda self: self.projected_gravity[:, 2] > 0.0}
     task = type("Mine", (LeggedRobot,), own)(small_config())

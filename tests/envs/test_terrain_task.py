@@ -88,6 +88,7 @@ def test_what_a_point_reads_beside_a_riser_is_a_setting(scan, seen):
     torch.testing.assert_close(reading.ground, torch.tensor(seen))
 
 
+@pytest.mark.slow
 def test_every_map_of_a_task_reads_what_its_configuration_says():
     """The true one, and the displaced one of a robot that drifts, on the same ground as before."""
     task = terrain_task("anymal_c", ("terrain.scan", "highest"), ("observations.height_map.shift", 0.05), NOISY)
@@ -110,6 +111,7 @@ def test_scan_on_a_plane_is_zero():
     assert not scan.heights.any()
 
 
+@pytest.mark.slow
 def test_heights_observation(task):
     """clip(base_z - 0.5 - h, -0.35, 0.35) * 2.5 in the last 187 of 235 columns, worked from the map itself."""
     observations = task.reset()["actor"]
@@ -183,6 +185,7 @@ def test_lowest_base_height_counts_from_the_ground():
     assert not task.terminated_buf.any()
 
 
+@pytest.mark.slow
 def test_initial_headings_are_drawn():
     task = terrain_task("anymal_c", ("init_state.yaw", [1.0, 1.2]))
     assert ((yaw(task) >= 1.0) & (yaw(task) <= 1.2)).all()
@@ -255,6 +258,7 @@ def test_levels_are_saved_and_restored(task):
     assert other.terrain_curriculum.levels.max() <= 1
 
 
+@pytest.mark.slow
 def test_without_a_curriculum_rows_are_hard_and_robots_stay():
     task = terrain_task("anymal_c", ("terrain.curriculum", False))
     before = task.terrain_curriculum.levels.clone()
@@ -320,6 +324,7 @@ def test_history_is_the_last_steps_oldest_first():
     assert group.buffer.tolist() == [[1, 2, 9], [3, 3, 9]]
 
 
+@pytest.mark.slow
 def test_the_history_of_a_task_moves_once_a_step_and_holds_no_other_episode():
     task = terrain_task("anymal_c_proprio")
     task.reset()
@@ -351,6 +356,7 @@ def test_a_held_heading_steers():
 # ---- mistakes, and a training --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

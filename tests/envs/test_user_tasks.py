@@ -74,6 +74,7 @@ def robot_at(folder: str) -> Path:
 # ---- files as tasks --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mine.yaml", "some/where/mine.yml"])
 def test_a_yaml_file_is_a_task_by_its_name(show, name):
     written(name, f"extends: {TASK}\nsim: {{nconmax: 5}}\n")
@@ -81,6 +82,7 @@ def test_a_yaml_file_is_a_task_by_its_name(show, name):
     assert (cfg.task, cfg.sim.nconmax) == ("mine", 5)
 
 
+@pytest.mark.slow
 def test_a_yaml_file_trains_and_its_run_lies_under_its_name():
     path = written("tasks/mine.yaml", f"extends: {TASK}\nrobot: ../robots/spotty\n")
     robot_at("robots/spotty")
@@ -112,10 +114,12 @@ def test_a_command_that_names_no_task_is_told_of_a_yaml_file_by_import(show, err
     assert "no episode of 'mine' is longer than 1 s" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_task_of_the_package_may_be_given_as_its_file(show):
     assert show("--task", str(registry.data_folder("cfg") / f"{TASK}.yaml")).task == TASK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -152,6 +156,7 @@ class Base(LeggedRobot):
         return self.rew_buf * 0.0
 
 
+@pytest.mark.slow
 def test_a_registered_task_can_be_extended_from_code_and_from_a_file(show):
     registry.register("base", {"extends": TASK, "sim": {"nconmax": 9}, "rewards": {"scales": {"nothing": 1.0}}}, Base)
     registry.register("middle", {"extends": "base", "env": {"seed": 4}})
@@ -183,6 +188,7 @@ def test_a_registered_task_may_take_the_name_of_the_one_it_extends():
     assert registry.task_config(TASK).env.num_envs == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parent", ["[a]", "3", "''", "{a: b}", "x/y", "../x", '"a\\nb"', '"a\\0b"', "x" * 5000])
 def test_what_cannot_be_extended_is_refused(error, parent):
     written("mine.yaml", f"extends: {parent}\n")
@@ -214,12 +220,14 @@ def test_a_robot_is_found_beside_the_file_that_names_it(show, monkeypatch, tmp_p
     assert load_robot(show("--task", str(tmp_path / "project/mine.yaml")).robot).name == "spotty"
 
 
+@pytest.mark.slow
 def test_a_robot_in_the_cpu_section_is_too(show):
     expected = str(robot_at("project/spotty").resolve())
     written("project/mine.yaml", f"extends: {TASK}\ncpu: {{robot: ./spotty}}\n")
     assert show("--task", "project/mine.yaml").robot == expected
 
 
+@pytest.mark.slow
 def test_a_robot_on_the_command_line_is_relative_to_the_working_directory(show, error):
     expected = str(robot_at("spotty").resolve())
     assert show("--task", TASK, "robot=./spotty").robot == show("--task", TASK, "robot=spotty").robot == expected
@@ -230,6 +238,7 @@ def test_a_robot_on_the_command_line_is_relative_to_the_working_directory(show, 
     assert "robot=FOLDER" in message
 
 
+@pytest.mark.slow
 def test_a_robot_of_a_registered_mapping_lies_beside_its_module(show, monkeypatch):
     expected = str(robot_at("project/spotty").resolve())
     module = f"import legged\nlegged.register('mine', {{'extends': '{TASK}', 'robot': './spotty'}})\n"
@@ -245,6 +254,7 @@ def test_no_robot_at_all_is_said(error):
 # ---- modules -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_module_finds_its_neighbours_and_its_files(show):
     written("project/neighbour.py", "COUNT = 7\n")
     written("project/mine.yaml", f"extends: {TASK}\nenv: {{seed: 8}}\n")
@@ -255,6 +265,7 @@ def test_a_module_finds_its_neighbours_and_its_files(show):
     assert (cfg.sim.nconmax, cfg.env.seed) == (7, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -287,6 +298,7 @@ def test_a_module_in_a_module_that_cannot_be_parsed_is_the_one_named(error):
     assert f"--import: outer_tasks.py ({inner}, line 1): SyntaxError" in error("--import", "outer_tasks.py", "--task", "x")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["no.such", ".relative", "/", "no.py/x.py", "x" * 5000, "x" * 5000 + ".py", "os.path.x", " "]
 )
@@ -302,6 +314,7 @@ def test_a_file_with_the_name_of_a_loaded_module_does_not_replace_it(error):
     assert sys.modules["json"] is json
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "words"),
     [

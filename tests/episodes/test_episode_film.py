@@ -88,6 +88,7 @@ def test_pictures_are_so_coarse_that_they_fit(share, monkeypatch):
     assert len(projector.show(0)["pictures"]) == 3
 
 
+@pytest.mark.slow
 def test_ground_that_is_larger_than_the_horizon_is_drawn():
     changes = [*ENGINE, *FEW_TILES, ("terrain.border_size", 110.0), ("terrain.horizontal_scale", 0.2)]
     cfg = task_config("anymal_c_blind", changes, on_cpu=True)
@@ -98,6 +99,7 @@ def test_ground_that_is_larger_than_the_horizon_is_drawn():
     assert (model.geom_size[:, :2].max(axis=1) > 0.0).all()
 
 
+@pytest.mark.slow
 def test_an_episode_is_drawn_where_pictures_can_be_made(monkeypatch):
     monkeypatch.setattr(page, "MOST_PICTURES", 2)
     episodes, cfg = roll_out(policy_of(str(POLICY)), Wish(1, 1, changes=SHORT), torch.device("cpu"))

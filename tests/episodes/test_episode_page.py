@@ -107,6 +107,7 @@ def test_hovering_over_a_plot_moves_the_picture_and_all_plots(opened):
     assert abs(pixel(page) - grey(25)) <= 2
 
 
+@pytest.mark.slow
 def test_keys_step_and_the_slider_drags(opened):
     page = opened(film_of_greys())
     for key, row in (("ArrowRight", 1), ("Shift+ArrowRight", 11), ("ArrowLeft", 10), ("End", STEPS - 1), ("Home", 0)):
@@ -117,6 +118,7 @@ def test_keys_step_and_the_slider_drags(opened):
     assert abs(pixel(page) - grey(20)) <= 2
 
 
+@pytest.mark.slow
 def test_playing_moves_the_cursor_until_the_end(opened):
     page = opened(film_of_greys())
     page.select_option("#speed", "2")
@@ -130,6 +132,7 @@ def test_playing_moves_the_cursor_until_the_end(opened):
     assert abs(pixel(page) - grey((STEPS - 1) // EVERY)) <= 2
 
 
+@pytest.mark.slow
 def test_plots_show_a_part_of_the_time_that_follows_the_cursor(opened):
     page = opened(film_of_greys())
     page.select_option("#span", "1")
@@ -142,6 +145,7 @@ def test_plots_show_a_part_of_the_time_that_follows_the_cursor(opened):
     assert page.evaluate("episode.state().shown")[1] == STEPS - 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1600, 420])
 def test_a_page_fits_the_screen(opened, width):
     page = opened(film_of_greys(), width)
@@ -150,6 +154,7 @@ def test_a_page_fits_the_screen(opened, width):
     wait(page, "episode.state().cursors.length > 8")
 
 
+@pytest.mark.slow
 def test_a_stick_figure_stands_in_for_the_film(opened):
     page = opened(stick_figure())
     assert "cannot render <b>here</b>" in page.locator("#facts").inner_text()

@@ -93,6 +93,7 @@ def test_where_nothing_can_be_drawn_a_page_has_a_stick_figure(monkeypatch, capsy
     np.testing.assert_allclose(places[0, 0], base, atol=6e-4)
 
 
+@pytest.mark.slow
 def test_other_tasks_show_what_they_have(capsys, monkeypatch):
     monkeypatch.setattr("legged.episodes.page.MOST_PICTURES", 4)
     policy = POLICY.parent / "half_cheetah"

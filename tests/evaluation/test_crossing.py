@@ -37,6 +37,7 @@ def result(engine: str, **changes: float | None) -> dict:
     return {"physics": engine, "device": "cpu", "contact_overflows": 0, "steps_per_s": 1234.5, **same, **changes}
 
 
+@pytest.mark.slow
 def test_all_engines_there_are_take_part():
     asked = [dict(engine.overrides) for engine in following.ENGINES.values()]
     names = [f"newton_{one['sim.solver']}" if "sim.solver" in one else one["sim.physics"] for one in asked]
@@ -63,6 +64,7 @@ def test_the_command_measures_each_engine_and_writes_beside_the_checkpoint(run, 
         assert words in out
 
 
+@pytest.mark.slow
 def test_the_file_says_what_was_changed(run, monkeypatch):
     figures = {"rmse_lin": {"mean": 0.1}, "rmse_ang": {"mean": 0.1}, "gait": {"base_height": 0.5}}
     figures |= {"falls": 0.0, "cost_of_transport": 0.5, "contact_overflows": 0}
@@ -73,6 +75,7 @@ def test_the_file_says_what_was_changed(run, monkeypatch):
     assert json.loads((run / "changed" / "crossing.json").read_text())["changes"] == {"sim.iterations": 30}
 
 
+@pytest.mark.slow
 def test_an_engine_in_which_everybody_fell_is_shown_without_numbers(tmp_path, capsys):
     nothing = dict.fromkeys(("rmse_lin", "rmse_ang", "cost_of_transport", "base_height"))
     rows = [result("mujoco"), result("newton_xpbd", **nothing, falls=1.0)]

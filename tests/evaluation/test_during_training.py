@@ -48,6 +48,7 @@ def test_few_robots_get_every_second_command_and_the_ends_stay():
     assert few_commands(small_config(("train.runner.evaluate_s", 0.3))).settle_s == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_figures_are_those_that_evaluate_finds_on_the_same_grid():
     """The same robots by the other way of measuring: rewards and errors of a policy under which nobody falls."""
     training = small_task(*BRIEF, ("env.seed", 5), num_envs=2)
@@ -70,6 +71,7 @@ def test_figures_are_those_that_evaluate_finds_on_the_same_grid():
     assert found["return"] == pytest.approx(float(torch.stack(rewards).sum(dim=0).mean()) / task.dt, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_step_of_it_fits_a_graph():
     """The guard finds nothing in it that no CUDA graph could hold."""
     evaluation = TrainingEvaluation(small_task(*BRIEF, num_envs=2))
@@ -77,6 +79,7 @@ def test_a_step_of_it_fits_a_graph():
         StepGraph(evaluation._step, torch.device("cpu"), enabled=True)
 
 
+@pytest.mark.slow
 def test_who_has_fallen_counts_as_standing_still():
     """Terminated in the first step: from then on the error is the whole command, cell by cell."""
     training = small_task(*BRIEF, ("terminations.min_base_height", 5.0), num_envs=2)

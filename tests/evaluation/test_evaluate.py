@@ -112,6 +112,7 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
     json.dumps(result, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen():
     """Its time is up at the end of step 15, so that of 30 steps those from 10 to 13 are of its first episode."""
     task = make_task(override(small_config(), [*undisturbed(2, 0.6), ("env.episode_length_s", 0.3)]))

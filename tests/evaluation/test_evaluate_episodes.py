@@ -59,6 +59,7 @@ def test_episodes_are_measured_and_written(run, capsys):
         assert words in out
 
 
+@pytest.mark.slow
 def test_seeds_and_engines_are_compared(run, tmp_path, capsys):
     assert call(episodes.main, [*SHORT, "--physics", "mujoco", "--episodes", "2", "--out", str(tmp_path / "1")]) == 0
     result = json.loads((tmp_path / "1" / "evaluation_mujoco.json").read_text())
@@ -167,6 +168,7 @@ def test_a_policy_for_something_else_is_refused(changes, name, words, tmp_path):
         run_exported(exported(tmp_path, 0.0, **changes), name, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "arguments", "words"),
     [

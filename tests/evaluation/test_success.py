@@ -166,6 +166,7 @@ def test_scripted_robots_on_a_real_task(monkeypatch):
     assert points[0]["mean_time_s"] == pytest.approx(0.1)  # 5 steps of 0.02 s
 
 
+@pytest.mark.slow
 def test_it_stops_when_everyone_is_done():
     task = task_on("flat", [0.0], 2)
     steps = 0
@@ -184,6 +185,7 @@ def test_it_stops_when_everyone_is_done():
 # ---- where robots stand, and what they are asked ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_robots_stand_on_the_tile_of_their_point_and_are_asked_to_leave_it(monkeypatch):
     monkeypatch.setattr(success, "TIME_S", 0.04)
     task = task_on("stairs_up", [0.05, 0.2], 16)
@@ -218,6 +220,7 @@ def test_robots_stand_on_the_tile_of_their_point_and_are_asked_to_leave_it(monke
     assert torch.equal(seen[1][2][:, [0, 1, 3]], commands[:, [0, 1, 3]])
 
 
+@pytest.mark.slow
 def test_robots_are_shared_out_among_random_tiles(monkeypatch):
     monkeypatch.setattr(tiles, "VARIANTS", 4)
     task = task_on("obstacles", [0.1, 0.2], 12)
@@ -249,6 +252,7 @@ def test_tiles_are_apart_from_each_other_and_random_ones_differ(monkeypatch):
         assert (two[0] == two[1]).all()
 
 
+@pytest.mark.slow
 def test_the_policy_sees_what_it_saw_in_training():
     """The same points, scales and noise; what is changed is the ground, not the observation."""
     exact = [

@@ -40,6 +40,7 @@ def test_one_with_errors_and_one_without_are_both_shown(run, capsys):
     assert "velocity RMSE" in out
 
 
+@pytest.mark.slow
 def test_the_table_and_the_report_of_the_run_are_written(run):
     assert call(table.main, []) == 0
     text = (run.parents[1] / "experiments.md").read_text()

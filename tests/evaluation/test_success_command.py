@@ -149,6 +149,7 @@ def test_small_robots_are_tracked_on_rough_ground_too():
     assert min(ground.tile_size) == pytest.approx(rough_side(grid), abs=cfg.terrain.horizontal_scale)
 
 
+@pytest.mark.slow
 def test_bumps_are_as_high_as_is_said_for_a_small_robot(tmp_path, capsys):
     """A Go2's ground is 0.589 times an ANYmal's."""
     cfg = override(run_config(POLICY.with_name("go2")), [("sim.physics", "mujoco"), ("sim.threads", 1)])
@@ -178,6 +179,7 @@ def test_types_are_measured_in_cells_that_make_what_they_are_called():
     assert np.diff(rises) * heights.cell == pytest.approx(0.28)
 
 
+@pytest.mark.slow
 def test_height_of_the_gait_is_above_the_ground():
     grid = Grid([0.0], [0.0], [0.0], robots=2, hold_s=1.0, settle_s=0.5)
     cfg = override(small_config(), [*undisturbed(2, 1.0), *on_terrain(small_config(), 8.0, 0.1)])
@@ -187,6 +189,7 @@ def test_height_of_the_gait_is_above_the_ground():
     assert result["contact_overflows"] == 0
 
 
+@pytest.mark.slow
 def test_lost_contacts_are_counted_over_all_rollouts(monkeypatch):
     grid = Grid([0.0], [0.0], [0.0], robots=3, hold_s=0.6, settle_s=0.2)
     changes = [*undisturbed(3, 0.6), ("train.runner.num_steps_per_env", 24)]  # so that 30 steps are a rollout and a part
@@ -277,6 +280,7 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
     assert "success_mujoco.png" in out
 
 
+@pytest.mark.slow
 def test_evaluate_alone_measures_both_on_the_task_s_own_grid_and_types(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(trained)
     asked = []

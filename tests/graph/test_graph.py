@@ -203,6 +203,7 @@ class ForkedCounts(LeggedRobot):
         return self.base_pos[:, 2]
 
 
+@pytest.mark.slow
 def test_joints_by_lists_of_numbers_give_the_same_reward_checked_and_not():
     rewards = []
     for graph in (True, False):
@@ -216,6 +217,7 @@ def test_joints_by_lists_of_numbers_give_the_same_reward_checked_and_not():
         torch.testing.assert_close(rewards[-1], by_hand)
 
 
+@pytest.mark.slow
 def test_a_count_in_a_term_is_refused_and_runs_without_a_graph():
     with pytest.raises(TermError, match=r"_reward_mine: self\.calls changed from \d+ to \d+: a CUDA graph repeats"):
         ForkedCounts(with_reward())

@@ -55,6 +55,7 @@ def test_the_example_of_the_page_runs(pictures):
     assert found["picture"].shape == (270, 480, 3)
 
 
+@pytest.mark.slow
 def test_the_learner_of_the_lab_learns(capsys):
     """Few and small updates: the code runs, episodes end within them, and the networks change."""
     code = example("lab/ppo_cheetah.md")

@@ -63,6 +63,7 @@ def test_rewards_are_gymnasium_s_own():
         assert reward == pytest.approx(infos["reward_forward"] + infos["reward_control"], abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["half_cheetah", ROBOT])
 def test_the_last_observation_is_that_of_an_episode_that_goes_on(task):
     """The internal reset is hidden: a twin whose episodes are longer sees the same, noise included."""
@@ -96,6 +97,7 @@ def test_a_failure_is_no_truncation():
     assert 1.0 <= env.reset()[0][0] <= 1.5
 
 
+@pytest.mark.slow
 def test_seeds_make_rollouts_and_nothing_else_does():
     env, other = single(ROBOT), single(ROBOT, {"domain_rand.push_interval_s": 0.1})
 
@@ -159,6 +161,7 @@ def test_without_a_seed_environments_differ():
     assert not np.array_equal(first, second)
 
 
+@pytest.mark.slow
 def test_pictures_show_the_end_of_an_episode_until_it_is_reset(pictures):
     sizes = {"render_mode": "rgb_array", "width": 96, "height": 64}
     short, long = (single("half_cheetah", {"env.episode_length_s": s}, **sizes) for s in (0.2, 20.0))

@@ -31,6 +31,7 @@ def test_spaces_are_batches_of_those_of_one_environment(task):
     env.close()
 
 
+@pytest.mark.slow
 @TASKS
 def test_rollouts_with_the_same_seed_are_equal(task):
     env = vector(task, 5, {"env.episode_length_s": 0.2})
@@ -46,6 +47,7 @@ def test_rollouts_with_the_same_seed_are_equal(task):
     assert not np.array_equal(first[0], other[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"observations.groups.actor.history": 3}])
 @TASKS
 def test_final_observations_are_those_of_episodes_that_go_on(task, settings):

@@ -93,6 +93,7 @@ def test_a_checkpoint_runs_no_code(model, capsys, place, command):
     assert not Path("it_ran").exists()
 
 
+@pytest.mark.slow
 def test_a_state_of_robots_runs_no_code(model, capsys):
     in_a_state_file(model)
     arguments = ["--resume", "--max_iterations", "2", "--num_envs", "4"]

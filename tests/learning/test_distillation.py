@@ -92,6 +92,7 @@ def test_an_update_waits_for_no_device(kind):
     assert alg.losses()["behavior"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_student_recovers_a_linear_teacher():
     """The teacher is a fixed linear map of what the student sees too; a student of one layer finds its numbers."""
     torch.manual_seed(0)

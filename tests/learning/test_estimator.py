@@ -275,6 +275,7 @@ def test_two_and_two_iterations_are_four():
         assert same(found[part], wanted[part]), part
 
 
+@pytest.mark.slow
 def test_a_transferred_estimator_learns_at_the_rate_of_the_configuration(tmp_path):
     """PPO's rate goes on where it was; the estimator's is not PPO's."""
     first = CapturedRunner(small_task(*SMALL, num_envs=2))
@@ -350,6 +351,7 @@ ESTIMATOR = "train.policy.estimator"
 LINEAR = f"{ESTIMATOR}.targets=[base_lin_vel]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

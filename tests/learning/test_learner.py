@@ -218,6 +218,7 @@ def test_checkpoints_are_exchanged_between_the_loops(first, second):
         assert not group["capturable"]
 
 
+@pytest.mark.slow
 def test_both_loops_log_the_same_things():
     tags = {}
     for loop in ("stock", "captured"):
@@ -229,6 +230,7 @@ def test_both_loops_log_the_same_things():
     ]
 
 
+@pytest.mark.slow
 def test_the_captured_loop_stops_when_asked():
     task = small_task(num_envs=4)
     runner = CapturedRunner(task, Path("run"), "cpu")
@@ -238,6 +240,7 @@ def test_the_captured_loop_stops_when_asked():
     assert checkpoints(Path("run")) == [0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loop", "learns"), [("stock", PPO), ("captured", DevicePPO)])
 def test_the_loop_is_a_setting(loop, learns, monkeypatch):
     """Training runs on the loop that the configuration names, whichever the flag or the default is."""

@@ -147,6 +147,7 @@ def test_terms_of_several_groups_lie_where_their_description_says():
     assert starts["actor", "dof_pos"] == 15 + 12
 
 
+@pytest.mark.slow
 def test_networks_read_the_groups_that_they_are_told_to():
     changes = [("observations.critic", ["dof_pos"]), ("train.policy.critic_observations", ["actor"])]
     alg = Runner(small_task(*changes)).alg
@@ -186,6 +187,7 @@ def test_the_std_stays_within_its_bounds_and_comes_back(kind, std_type, tmp_path
         assert action_std(policy).max() <= 0.55 + 1e-6
 
 
+@pytest.mark.slow
 def test_bounds_that_are_narrowed_hold_after_a_resume():
     folder = tiny_run("train.policy.init_noise_std=0.8")
     narrow = ["train.policy.max_noise_std=0.6", "train.policy.init_noise_std=0.6"]
@@ -195,6 +197,7 @@ def test_bounds_that_are_narrowed_hold_after_a_resume():
     assert after["distribution.std_param"].max() <= 0.6
 
 
+@pytest.mark.slow
 def test_a_std_that_is_fixed_by_its_bounds_does_not_change():
     same = [f"train.policy.{name}_noise_std=0.3" for name in ("init", "min", "max")]
     state = read_checkpoint(tiny_run(*same) / "model_1.pt")["actor_state_dict"]
@@ -259,6 +262,7 @@ def test_a_checkpoint_of_other_networks_is_refused(changes, text, says, tmp_path
         check_fits(path, saved, small_config(*sizes, *changes))
 
 
+@pytest.mark.slow
 def test_a_checkpoint_from_before_groups_had_names_is_resumed(capsys):
     folder = tiny_run(*UNLIKE)
     path = folder / "model_1.pt"
@@ -277,6 +281,7 @@ def test_a_checkpoint_from_before_groups_had_names_is_resumed(capsys):
     assert "its actor has history 2, the configuration has observations.groups.actor.history 3" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_optimiser_of_another_kind_is_not_resumed(capsys):
     folder = tiny_run()
     capsys.readouterr()

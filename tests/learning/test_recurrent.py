@@ -72,6 +72,7 @@ def test_a_recurrent_policy_is_trained_resumed_played_and_exported(kind, capsys)
     assert told["onnx_inputs"] == (["h_in", "c_in"] if kind == "lstm" else ["h_in"])
 
 
+@pytest.mark.slow
 def test_training_says_that_rsl_rls_loop_runs_and_why(capsys):
     arguments = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "1"]
     assert call(train.main, [*arguments, *TINY_TRAINING, *flags("gru")]) == 0
@@ -143,6 +144,7 @@ def test_a_checkpoint_of_another_kind_is_refused(trained, asked, text, tmp_path)
         check_fits(path, read_checkpoint(path), small_config(*recurrent(asked)))
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_width_or_depth_is_refused(tmp_path):
     path = tmp_path / "model_0.pt"
     Runner(small_task(*recurrent("gru"))).save(str(path))

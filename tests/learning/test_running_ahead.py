@@ -64,6 +64,7 @@ def test_an_iteration_is_logged_while_the_next_one_is_computed(ahead, order):
     ]
 
 
+@pytest.mark.slow
 def test_without_that_each_is_logged_at_once(order):
     assert runner_of(Path("run")).train(3)
     assert order == ["go", "log 0", "save", "go", "log 1", "go", "log 2", "save"]

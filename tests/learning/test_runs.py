@@ -23,6 +23,7 @@ pytestmark = pytest.mark.usefixtures("workplace")
 ARGUMENTS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "1", *TINY_TRAINING]
 
 
+@pytest.mark.slow
 def test_runs_that_begin_in_the_same_second_have_folders_of_their_own(monkeypatch):
     monkeypatch.setattr(runs, "stamped", lambda _: "2026-01-01_00-00-00")
     monkeypatch.setattr(runs, "code_state", lambda: "")
@@ -248,6 +249,7 @@ def test_a_run_of_an_odd_name_is_not_there(name):
         runs.run_config(runs.find_run(small_config(), name))
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_network_of_its_motors(tmp_path):
     """Its file may be moved or fitted anew; the run is restored from its own folder, wherever that is put."""
     rng = np.random.default_rng(5)

@@ -55,6 +55,7 @@ def built(*overrides) -> StudentRunner:
 # ---- the rollout ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_student_acts_and_the_teacher_labels():
     """Actions are the student's with its noise; labels are the teacher's means for the state that the student got into."""
     runner = built()
@@ -73,6 +74,7 @@ def test_the_student_acts_and_the_teacher_labels():
     assert float(far) > 0.2, "they do not do the same yet"
 
 
+@pytest.mark.slow
 def test_the_teacher_sees_without_noise_and_the_student_with():
     runner = built()
     scales = runner.env.observation_scales()
@@ -132,6 +134,7 @@ def test_a_student_is_trained_logged_played_and_exported(capsys):
     assert "largest difference to the policy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_loss_and_the_teacher_are_told(capsys):
     arguments = [*STUDENT, "--teacher", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "1"]
     assert call(train.main, [*arguments, *TINY_TRAINING]) == 0
@@ -183,11 +186,13 @@ def test_a_teacher_with_a_memory_teaches(loop):
     assert same(dict(taught.weights), content(teacher, 1)["actor_state_dict"])
 
 
+@pytest.mark.slow
 def test_evaluations_during_training_are_of_the_student():
     folder = student("train.runner.evaluate_interval=2", "train.runner.evaluate_share=1", "train.runner.evaluate_s=0.5")
     assert (folder / "model_best.pt").is_file()
 
 
+@pytest.mark.slow
 def test_the_sequel_goes_on_from_rewards(capsys):
     """PPO begins with what the student has learned, a new value function that learns alone at first, and a std of its own."""
     source = student(num_envs=24)
@@ -231,6 +236,7 @@ def test_a_teacher_that_does_not_fit_ends_the_start_with_one_line(arguments, say
     assert says in line
 
 
+@pytest.mark.slow
 def test_a_teacher_needs_the_same_points_of_the_ground(capsys):
     flags = ["--task", "anymal_c_student", "--teacher", "anymal_c", *TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, [*flags, "train.distillation.gradient_length=2", "terrain.measured_points_x=[0.0,0.5]"]) == 2
@@ -270,6 +276,7 @@ def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
     assert student(strong[0], shown, *mild[1:], teacher=teacher, iterations=1).is_dir()
 
 
+@pytest.mark.slow
 def test_a_policy_with_an_estimator_is_no_teacher(capsys):
     folder = tiny_run("--task", TASK, "train.policy.estimator.targets=[base_lin_vel]", iterations=1)
     assert call(train.main, [*STUDENT, "--teacher", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]) == 2
@@ -297,6 +304,7 @@ def test_flags_that_do_not_go_together_are_refused(capsys):
     assert f"{TEACHER}: a resumed training can't change '{TASK}'; got 'anymal_c'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_its_teacher_is_not_resumed(capsys):
     folder = student()
     saved = content(folder, 1)
@@ -314,6 +322,7 @@ def test_a_group_of_the_students_own_keeps_its_name():
         find_teacher(cfg)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_file_can_be_the_teacher():
     folder = tiny_run(iterations=2)
     cfg = task_config("anymal_c_student", [*SMALL, (TEACHER, str(folder / "model_0.pt"))], on_cpu=True)

@@ -155,6 +155,7 @@ def test_rsl_rl_learns_from_both(kind, monkeypatch):
     assert losses[0]["symmetry"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_training_with_symmetry_runs_from_the_command_line():
     tiny_run("train.algorithm.symmetry=true")
 

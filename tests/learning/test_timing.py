@@ -30,6 +30,7 @@ def test_a_training_says_how_long_it_took_and_a_resumed_one_that_it_was_resumed(
     assert (again.iterations, again.steps, again.resumed) == (3, 96, True)
 
 
+@pytest.mark.slow
 def test_numbers_are_those_that_are_printed(capsys):
     arguments = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "4", "--max_iterations", "1", *TINY_TRAINING]
     assert train.main(arguments) == 0

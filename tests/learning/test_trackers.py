@@ -116,6 +116,7 @@ def test_weights_and_biases_get_what_tensorboard_gets_and_the_files_of_the_run(m
     assert fake.calls[-1] == ("finish",)
 
 
+@pytest.mark.slow
 def test_a_writer_of_one_s_own_stands_beside_tensorboard():
     folder = tiny_run(own_tracker(), iterations=2)
     lines = Path("lines.txt").read_text().splitlines()
@@ -126,6 +127,7 @@ def test_a_writer_of_one_s_own_stands_beside_tensorboard():
     assert scalars(folder)["Loss/value"] == [0, 1]
 
 
+@pytest.mark.slow
 def test_a_tracker_that_fails_ends_nothing_and_is_told_of_once(capsys):
     assert train.main([*ARGUMENTS, own_tracker(fails_at=1), "--max_iterations", "4"]) == 0
     (folder,) = run_folders()

@@ -42,6 +42,7 @@ def optimiser_steps(checkpoint: dict) -> set[int]:
 # ---- what a run leaves behind ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_leaves_its_configuration_the_state_of_the_code_events_and_checkpoints():
     folder = tiny_run("--run_name", "first", "--seed", "7", "rewards.scales.torques=-3e-5")
     assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_first", folder.name)
@@ -61,6 +62,7 @@ def test_a_run_leaves_its_configuration_the_state_of_the_code_events_and_checkpo
     assert optimiser_steps(saved(folder, 0)) == {UPDATES}
 
 
+@pytest.mark.slow
 def test_tensorboard_gets_metrics_and_rewards_and_never_nan():
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -76,6 +78,7 @@ def test_tensorboard_gets_metrics_and_rewards_and_never_nan():
     assert [event.step for event in events.Scalars("Metrics/lin_vel_rmse")] == [0, 1]
 
 
+@pytest.mark.slow
 def test_lines_are_plain_where_there_is_no_terminal(capsys):
     arguments = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", "--max_iterations", "2", *TINY_TRAINING]
     assert train.main(arguments) == 0

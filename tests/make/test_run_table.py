@@ -114,6 +114,7 @@ def test_what_failed_is_a_line_and_no_part_of_the_mean():
     assert "with a *" in text
 
 
+@pytest.mark.slow
 def test_runs_are_found_in_folders_and_beside_shipped_policies(tmp_path):
     shipped = find_runs([POLICY])
     assert [(one.seed, sorted(one.results)[:2]) for one in shipped] == [(n, ["mujoco", "mujoco_warp"]) for n in (1, 2, 3)]

@@ -40,6 +40,7 @@ def test_scales_by_joint_and_joints_that_are_held_by_hand():
     assert law.compute(torch.zeros(2, 12), torch.zeros(2, 12))[0, :3].tolist() == pytest.approx([0.0, 8.0, -24.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -69,6 +70,7 @@ HUMANOID = [
 ]
 
 
+@pytest.mark.slow
 def test_a_task_whose_arms_are_held_has_fewer_actions_than_joints(tmp_path):
     """15 of 29: observations see all joints, actions and their mirror images those that have one, and so does the export."""
     task = small_task(*HUMANOID, num_envs=2)

@@ -88,6 +88,7 @@ def test_no_load_speeds_may_differ_from_robot_to_robot(kernels):
     torch.testing.assert_close(found[1::2], full(40.0)[1::2])
 
 
+@pytest.mark.slow
 def test_velocity_limits_that_are_drawn_are_the_motors_own():
     task = small_task(("control.actuator.model", "dc_motor"), ("domain_rand.ranges", {"velocity_limit": [0.8, 0.8]}))
     curve = task.control.actuator.curve
@@ -218,6 +219,7 @@ def test_after_a_reset_joints_hold_what_their_encoders_show_as_default(kernels):
     torch.testing.assert_close(made.compute(full(0.0), full(0.0)), full(40.0))
 
 
+@pytest.mark.slow
 def test_kernels_and_torch_agree():
     """Bit by bit but for the friction, whose exponential and tangent are other libraries'."""
     plain = dict(model="dc_motor", joints=("HFE", "KFE"), no_load_speed={"H": 6.0, "K": 4.0}, delay=(0, 9))
@@ -279,6 +281,7 @@ def test_ideal_motors_are_the_control_law_itself():
         assert not is_ideal(replace(ActuatorConfig(), **setting))
 
 
+@pytest.mark.slow
 def test_a_task_with_every_model_is_checked_walks_and_resumes():
     settings = [
         ("control.actuator.model", "dc_motor"),
@@ -292,6 +295,7 @@ def test_a_task_with_every_model_is_checked_walks_and_resumes():
     assert task.control.actuator.delay.unique().numel() > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "value", "said"),
     [

@@ -375,6 +375,7 @@ NAMED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "line", "words"), NAMED, ids=[entry[1] for entry in NAMED])
 def test_fields_of_another_form_are_named(migrated, section, line, words):
     (lost,) = migrated(sections(**{section: line})).lost

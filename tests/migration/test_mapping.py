@@ -39,6 +39,7 @@ SETTINGS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("section", "line", "path", "value"), SETTINGS, ids=[setting[2] for setting in SETTINGS])
 def test_a_setting_goes_where_it_means_the_same(migrated, section, line, path, value):
     found = migrated(sections(**{section: line}))
@@ -112,6 +113,7 @@ def test_what_has_no_counterpart_is_listed_by_file_and_line(migrated, section, l
 RANGES = "motor_strength_range = [0.8, 1.2]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lines", "lost", "ranges"),
     [
@@ -153,6 +155,7 @@ def test_a_robot_that_is_not_here_is_said_with_its_commands(migrated):
     assert not Path("there/robots").exists()
 
 
+@pytest.mark.slow
 def test_a_robot_folder_of_the_users_is_taken_where_it_lies(migrated):
     robot = load_robot("anymal_c")
     folder = Path("elsewhere/spotty")

@@ -35,6 +35,7 @@ def rolled(robot, count: int, threads: int, broken: int | None = None) -> torch.
     return snapshot(physics)
 
 
+@pytest.mark.slow
 def test_numbers_of_a_world_depend_on_neither_threads_nor_company(robot):
     alone = rolled(robot, COUNT, threads=1)
     assert torch.isfinite(alone).all()

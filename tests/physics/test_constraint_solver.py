@@ -103,6 +103,7 @@ def test_every_kind_of_row_pushes_as_in_c_mujoco(device, cone, tendon):
     assert 1 <= rounds.max() < 20
 
 
+@pytest.mark.slow
 def test_without_constraints_the_acceleration_is_that_of_a_free_body(device):
     model = mujoco.MjModel.from_xml_string(EVERY_ROW.replace('frictionloss="0.8"', "").split("<equality>")[0] + "</mujoco>")
     data = mujoco.MjData(model)

@@ -97,6 +97,7 @@ class Stage:
         return np.concatenate(columns, axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("device", ["cpu", on_gpu("cuda:0")])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_shape_meets_a_plane_as_in_c_mujoco(shape, device):

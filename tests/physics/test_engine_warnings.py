@@ -13,6 +13,7 @@ from legged.physics.engine_warnings import each_warning_once
 pytestmark = pytest.mark.usefixtures("workplace")
 
 
+@pytest.mark.slow
 def test_many_broken_worlds_are_one_line_and_no_file(capfd):
     task = small_task(num_envs=6)
     before = mujoco.get_mju_user_warning()

@@ -174,6 +174,7 @@ def test_a_field_does_what_the_same_change_by_hand_does(physics, change):
     assert max(ends) > 1e-3  # fifty times what is allowed above
 
 
+@pytest.mark.slow
 def test_values_given_again_replace_those_before(physics):
     """A resumed training gives what was drawn once more; and the order of fields that share an array does not matter."""
     model = physics.model

@@ -44,7 +44,13 @@ TOLERANCES = {
 }
 
 
-@pytest.fixture(params=TOLERANCES, scope="module")
+SLOW = ("steel", "kamino")
+"""Solvers whose kernels take long to compile or to load."""
+
+
+@pytest.fixture(
+    params=[pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in TOLERANCES], scope="module"
+)
 def solver(request) -> str:
     return request.param
 
@@ -88,6 +94,7 @@ def test_it_stands_like_c_mujoco_and_the_ground_carries_its_weight(newton, solve
     assert not newton.overflowed.any()
 
 
+@pytest.mark.slow
 def test_it_falls_freely_and_turns_freely(newton, solver, robot):
     """Off the ground, with a spin: speed is g t, and the spin about the vertical stays. The base's origin is not its centre
     of mass, so wrong conventions of velocity show.
@@ -146,6 +153,7 @@ def test_writing_a_world_and_blowing_it_up_leaves_the_others_bit_identical(newto
     assert torch.equal(bits(roll(newton, start.dof_pos, 20)), bits(expected))
 
 
+@pytest.mark.slow
 def test_the_recorded_step_is_the_eager_one(newton, robot, monkeypatch):
     """What a solver decides on the host is fixed when its step is recorded; nothing it decides may change later."""
     states = random_states(robot, N, seed=7)

@@ -113,6 +113,7 @@ def test_a_cheaper_solver_drifts_but_stays_near(make_physics, robot):
     assert 1e-4 < position_drift(largest) < 0.5
 
 
+@pytest.mark.slow
 def test_feet_are_right_on_legs_with_turned_bodies_and_joints_off_centre(robot, backend, tmp_path):
     """ANYmal C's bodies are all parallel and its hinges sit at their origins; another robot's need not."""
     spec = mujoco.MjSpec.from_file(str(robot.model_path))
@@ -135,6 +136,7 @@ def test_feet_are_right_on_legs_with_turned_bodies_and_joints_off_centre(robot, 
 # ---- contact forces ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_at_rest_the_ground_carries_the_weight(physics, robot):
     """Forces are those on the robot, so upward on feet; shapes in the air feel exactly nothing."""
     states = standing(robot, 6)
@@ -161,6 +163,7 @@ def test_in_the_air_nothing_is_felt_and_the_robot_falls_freely(physics, robot):
     torch.testing.assert_close(physics.robot_state.base_lin_vel[:, 2], torch.full((6,), -GRAVITY * 0.2), atol=1e-3, rtol=0.0)
 
 
+@pytest.mark.slow
 def test_friction_is_drawn_per_world(make_physics, backend, robot):
     """Standing robots pushed sideways in one batch: a slippery world slides v^2 / (2 mu g) = 0.5 m, a rough one stays."""
     physics = make_physics(backend, tag="randomized")
@@ -177,6 +180,7 @@ def test_friction_is_drawn_per_world(make_physics, backend, robot):
     assert (slid[friction == 1.0].abs() < 0.1).all()
 
 
+@pytest.mark.slow
 def test_added_base_mass_is_drawn_per_world(make_physics, backend, robot):
     physics = make_physics(backend, tag="randomized")
     added = torch.tensor([-5.0, -2.0, 0.0, 2.0, 5.0, 10.0])
@@ -189,6 +193,7 @@ def test_added_base_mass_is_drawn_per_world(make_physics, backend, robot):
     torch.testing.assert_close(carried, (robot.mass + added) * GRAVITY, rtol=0.005, atol=0.0)
 
 
+@pytest.mark.slow
 def test_added_base_mass_replaces_the_one_before(make_physics, backend, robot):
     """It is added to the model's mass, not to what the world weighs by now; none again means the model's."""
     physics = make_physics(backend, tag="randomized")

@@ -26,6 +26,7 @@ def only(index: int) -> torch.Tensor:
 # ---- worlds that stay apart ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_written_state_reads_back(physics, robot):
     """Velocities are given and read in the base frame, which here is anywhere; the engines store the linear one in the
     world's.
@@ -55,6 +56,7 @@ def test_write_clears_forces_and_torques_of_its_worlds_only(physics, robot):
     assert (torques != 0.0).any(dim=1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("written", [0, 3])
 def test_writing_one_world_leaves_the_others_bit_identical(physics, robot, written):
     """In the middle of contact, now and for the next 20 steps, then as far as runs can be repeated; mujoco-warp's own
@@ -87,6 +89,7 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("elsewhere")
 def test_a_world_that_blows_up_is_confined_and_curable(physics, robot):
     """Neighbours keep their bits; NaN stays until the task writes a good state (no engine may reset it silently); then
@@ -245,6 +248,7 @@ def test_the_c_engine_on_a_gpu_is_an_error_that_says_what_to_do():
         resolve_physics("mujoco", torch.device("cuda:0"))
 
 
+@pytest.mark.slow
 def test_make_physics_builds_what_is_named(make_physics, backend):
     built = engine_of(make_physics(backend))
     name, _, gpu = backend.partition(", ")

@@ -82,6 +82,7 @@ def test_a_step_of_any_robot_is_that_of_c_mujoco(seed, device):
     check_steps(seed, int(rng.integers(2, 41)), [extra for extra in EXTRAS if rng.random() < 0.5], device)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("extras", [("damping", "self-collision"), EXTRAS], ids=["few extras", "all extras"])
 def test_a_hundred_steps_are_those_of_c_mujoco(extras, device):
     """To 1e-4, with contacts that come and go. A world in which one engine meets the ground a step earlier than the other is

@@ -25,6 +25,7 @@ def test_robots_are_found():
     assert {"anymal_c", "go2", "spot", "g1", "cassie"} <= set(ROBOTS)
 
 
+@pytest.mark.slow
 def test_mujoco_warp_takes_it(robot):
     model = RobotScene(robot).model(SimConfig(), "none")
     with wp.ScopedDevice("cpu"):
@@ -33,6 +34,7 @@ def test_mujoco_warp_takes_it(robot):
     assert (taken.nq, taken.nv, taken.nu) == (model.nq, model.nv, robot.num_dof)
 
 
+@pytest.mark.slow
 def test_newton_takes_it(robot):
     """Joints, shapes and masses are where the layout says; robots with passive joints are refused elsewhere."""
     if robot.passive is not None:

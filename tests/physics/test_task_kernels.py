@@ -124,6 +124,7 @@ def ground() -> Terrain:
     return Terrain.build(replace(TerrainConfig(), mesh_type="height_map", proportions=names, num_rows=4, num_cols=8), 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scan", ["lowest", "own", "highest"])
 def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere(scan):
     terrain = ground()

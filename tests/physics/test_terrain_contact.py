@@ -166,6 +166,7 @@ def test_a_step_and_its_edge(shape):
     assert compare(ours, theirs, min(0.7 * RADIUS[shape], 0.03), first_only=capsule) >= 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("shape", "share"), [("wheel", 0.8), ("drum", 0.95)])
 def test_a_cylinder_at_a_step(shape, share):
     """Of random poses that cut into it by up to 3 cm, most are as deep as in C MuJoCo, within 1 mm; what differs are
@@ -203,6 +204,7 @@ def test_a_wheel_meets_a_curb_at_its_rim():
     np.testing.assert_allclose(sorted(c.pos[1] for c in found), [-0.01, 0.07], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["foot", "shank", "trunk", "box", "wheel", "drum"])
 @pytest.mark.parametrize(("along_x", "along_y"), [(0.0, 0.0), (0.4, 0.0), (-0.25, 0.3)])
 def test_planes_and_slopes(shape, along_x, along_y):
@@ -295,6 +297,7 @@ def test_a_capsule_rests_on_a_ridge_between_its_ends():
     np.testing.assert_allclose(min(found, key=lambda c: c.dist).normal, [0.0, 0.0, 1.0], atol=0.02)
 
 
+@pytest.mark.slow
 def test_resting_heights_and_positions_are_those_of_c_mujoco():
     """Dropped from 1 cm and left for 1 s on a tread; on a slope of 15 %, which friction holds."""
     heights = np.zeros((40, 40))
@@ -318,6 +321,7 @@ def test_resting_heights_and_positions_are_those_of_c_mujoco():
     np.testing.assert_allclose(rest[0], data.qpos, atol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [1e9, 1e30, np.inf, np.nan])
 def test_a_world_that_blew_up_ends_and_harms_no_neighbour(far):
     """Its trunk is somewhere absurd, below the ground too; the next world's lies on the ground as ever."""

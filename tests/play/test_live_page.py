@@ -64,6 +64,7 @@ def labels(page: Page) -> list[str]:
     return [handle.label for handle in handles]
 
 
+@pytest.mark.slow
 def test_controls_that_make_no_sense_are_not_there():
     quadruped, cheetah = page_of(TASK, 2), page_of("half_cheetah", 2)
     try:
@@ -76,6 +77,7 @@ def test_controls_that_make_no_sense_are_not_there():
         cheetah.close()
 
 
+@pytest.mark.slow
 def test_while_nobody_looks_nothing_is_simulated():
     page = page_of(TASK)
     with running(page):

@@ -207,6 +207,7 @@ def test_a_checkpoint_that_was_asked_for_stays(run):
     assert not session.watched.has_best
 
 
+@pytest.mark.slow
 def test_robots_are_put_onto_chosen_tiles_and_keep_their_policy(session):
     assert session.grounds[0] == PLANE
     session.go_to("lava", 0.5)

@@ -94,6 +94,7 @@ def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):
     assert [path.name for path in Path("out").iterdir()] == ["exported"]
 
 
+@pytest.mark.slow
 def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, monkeypatch, capsys):
     def fail(*_):
         raise RunError("cannot render here")
@@ -105,6 +106,7 @@ def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, mo
     assert err == "error: cannot render here, or play with --no-video\n"
 
 
+@pytest.mark.slow
 def test_a_window_that_does_not_open_is_told_and_a_film_is_made(short, monkeypatch, capsys):
     monkeypatch.setattr(play, "HEADLESS", False)
     monkeypatch.setattr(play, "window_opens", lambda: False)
@@ -114,6 +116,7 @@ def test_a_window_that_does_not_open_is_told_and_a_film_is_made(short, monkeypat
     assert Path("out/play.mp4").is_file()
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_found_before_anything_is_built(monkeypatch, capsys):
     Path("file").write_text("mine")
     monkeypatch.setattr(legged.policies.restore, "make_task", lambda *_: pytest.fail("built"))
@@ -121,6 +124,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_built(monke
     assert "file/below: cannot make the folder: file is a file" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_export_onto_a_full_disk_is_one_line(monkeypatch):
     """Torch would abort the process; so it never writes to the disk itself."""
     task = small_task(num_envs=2)

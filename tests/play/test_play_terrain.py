@@ -139,6 +139,7 @@ def test_a_task_on_steps_has_the_constraint_rows_that_play_gives_to_others():
     assert (sim.njmax, sim.nconmax) == (ROWS_NEEDED, ROWS_NEEDED // 4)  # a contact has four rows
 
 
+@pytest.mark.slow
 def test_robots_start_on_their_tiles_and_face_along_x():
     ground = playground(config())
     task = on(ground, config(), num_envs=10)

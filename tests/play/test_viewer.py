@@ -40,6 +40,7 @@ def test_other_keys_do_nothing_and_backspace_asks_for_a_new_start():
     assert keyboard.restart
 
 
+@pytest.mark.slow
 def test_n_goes_on_to_the_next_tile(capsys):
     cfg = task_config("anymal_c", [*ENGINE, *CALM], on_cpu=True)
     playground = Playground.of(cfg, None, None)

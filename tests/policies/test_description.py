@@ -206,6 +206,7 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
     assert "(0, 0, -1) when the base is level" in terms["projected_gravity"]["formula"]
 
 
+@pytest.mark.slow
 def test_the_law_and_the_time_are_those_of_the_task():
     told = describe(small_task(("control.control_type", "V")))
     assert told["conventions"]["torque"].startswith("clip(stiffness * (action_scale * action - dq) - damping * ddq")
@@ -224,6 +225,7 @@ def test_gains_are_a_number_for_each_joint_whatever_is_drawn_for_them():
     assert told["default_joint_angles"] == usual["default_joint_angles"]
 
 
+@pytest.mark.slow
 def test_a_user_defined_term_is_described_by_its_docstring_and_its_unit():
     class Mine(LeggedRobot):
         MIRRORED = {**LeggedRobot.MIRRORED, "feet": "feet", "bare": "same"}

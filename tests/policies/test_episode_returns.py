@@ -45,6 +45,7 @@ class Account:
         return float(np.array(self.rewards)[: last + 1, i].sum()), last + 1, bool(np.array(self.failed)[last, i])
 
 
+@pytest.mark.slow
 def test_first_episodes_end_with_a_failure_and_nothing_counts_after_it():
     task = task_of("humanoid", 4, ("env.episode_length_s", 3.0))
     account = Account(task)
@@ -75,6 +76,7 @@ def test_nothing_fails_where_nothing_ends_an_episode_but_time():
     assert measured["metrics"]["x_velocity"] == pytest.approx(measured["terms"]["forward"] / 20, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_returns_are_in_the_unit_of_the_terms_whether_or_not_rewards_are_scaled_by_time():
     """A legged robot's rewards are scale * dt * term."""
     changes = ("env.episode_length_s", 0.2), ("train.runner.num_steps_per_env", 1000)

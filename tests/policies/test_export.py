@@ -59,6 +59,7 @@ def test_torchscript_computes_the_policy(exported, cases):
     assert (script(observations) - actions).abs().max() < 1e-5
 
 
+@pytest.mark.slow
 def test_onnx_computes_the_policy_for_any_batch_size(exported, cases):
     observations, actions = cases
     session = onnxruntime.InferenceSession(str(exported[0] / "policy.onnx"), providers=["CPUExecutionProvider"])
@@ -112,6 +113,7 @@ def test_the_metadata_says_what_a_controller_must_know(exported, runner):
     assert (metadata["task"], metadata["robot"]) == ("anymal_c_flat", "anymal_c")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["policy.pt", "policy.onnx", "policy.weights"])
 def test_an_export_that_computes_something_else_is_refused_by_name(runner, tmp_path, monkeypatch, file):
     function = {"policy.pt": "_torchscript", "policy.onnx": "_onnx", "policy.weights": "weights_of"}[file]
@@ -147,6 +149,7 @@ def test_an_export_that_gives_nan_is_refused(runner, tmp_path, monkeypatch):
     assert not (tmp_path / "policy.json").exists()
 
 
+@pytest.mark.slow
 def test_a_policy_of_large_actions_may_differ_by_their_share(tmp_path):
     """float32 has seven digits: of actions of 2e6 the last one is 0.1, which is no fault of an export."""
     sizes = [("train.policy.actor_hidden_dims", [128, 64, 32]), ("train.policy.critic_hidden_dims", [8])]

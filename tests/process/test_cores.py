@@ -53,6 +53,7 @@ def test_without_groups_nothing_is_limited(tmp_path):
     assert quota(tmp_path, tmp_path / "missing") == math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("given", "found"), [(None, "PASSIVE"), ("ACTIVE", "ACTIVE")])
 def test_threads_wait_without_spinning_unless_the_user_says_otherwise(given, found):
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}

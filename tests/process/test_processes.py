@@ -31,6 +31,7 @@ def ran(jobs, room, shared=()):
     return log.read_text().splitlines()
 
 
+@pytest.mark.slow
 def test_as_many_run_side_by_side_as_there_is_room_for(tmp_path):
     jobs = [script(Kind.ON_CORES, name, tmp_path / "log") for name in "abc"]
     noted = ran(jobs, {Kind.ON_CORES: 2})

@@ -95,6 +95,7 @@ def test_a_list_that_nobody_reads_ends_in_one_line():
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_start_of_a_process_that_a_timed_one_begins_is_not_its_own(tmp_path, monkeypatch):
     monkeypatch.setenv(STAGES_FILE, str(tmp_path / "stages"))
     code = "from legged.process.startup import stage_ended; stage_ended('mine')"

@@ -36,6 +36,7 @@ def put(task, env: int, x: float) -> None:
     task.physics.refresh()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.0, 37.3])
 def test_the_followed_cheetah_is_in_the_middle(task, camera, x):
     put(task, 1, x)
@@ -49,11 +50,13 @@ def test_the_followed_cheetah_is_in_the_middle(task, camera, x):
     assert 0.2 * WIDTH < ends[1, 0] - ends[0, 0] < 0.8 * WIDTH  # x goes to the right
 
 
+@pytest.mark.slow
 def test_pictures_leave_the_simulated_model_alone(task, camera):
     assert task.physics.model.vis.quality.shadowsize > 0
     assert camera.model.vis.quality.shadowsize == 0
 
 
+@pytest.mark.slow
 def test_a_moving_cheetah_changes_the_picture(task, camera):
     put(task, 0, 0.0)
     first = camera.picture().astype(int)

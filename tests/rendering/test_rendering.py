@@ -49,6 +49,7 @@ def differ(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (np.abs(one.astype(int) - other) > 4).any(axis=2)
 
 
+@pytest.mark.slow
 def test_picture_shows_the_robots(camera):
     picture = camera.picture()
     assert picture.shape == (HEIGHT, WIDTH, 3)
@@ -58,6 +59,7 @@ def test_picture_shows_the_robots(camera):
     assert columns.max() - columns.min() > WIDTH / 4  # side by side
 
 
+@pytest.mark.slow
 def test_each_robot_is_drawn(task, camera):
     """One robot from the same distance shows half of the red, and for one the camera comes nearer."""
     both = red(camera.picture()).sum()
@@ -69,6 +71,7 @@ def test_each_robot_is_drawn(task, camera):
     assert 0.3 * both < one < 0.7 * both
 
 
+@pytest.mark.slow
 def test_picture_is_the_same_until_the_robots_move(task, camera):
     first = camera.picture()
     assert not differ(camera.picture(), first).any()
@@ -79,6 +82,7 @@ def test_picture_is_the_same_until_the_robots_move(task, camera):
     assert differ(camera.picture(), first).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_commanded_velocity_is_a_green_arrow(task, camera):
     def green(picture: np.ndarray) -> int:
         r, g, b = (picture[:, :, i].astype(int) for i in range(3))
@@ -93,6 +97,7 @@ def test_commanded_velocity_is_a_green_arrow(task, camera):
     task.commands[2, 0] = 1.0  # is not in the picture
 
 
+@pytest.mark.slow
 def test_caption_is_drawn_in_the_upper_left_corner_only(camera):
     plain = camera.picture()
     captioned = camera.picture(["commanded 1.0 m/s", "actual 0.9 m/s"])
@@ -162,6 +167,7 @@ def test_the_ground_is_in_the_picture(camera_in_pit):
         assert 0.005 < red(picture).mean() < 0.3
 
 
+@pytest.mark.slow
 def test_colours_span_the_heights_there_are_and_level_ground_is_checkered(pit):
     model = display_model(pit.robot, 0, WIDTH, HEIGHT, pit.terrain)
     tops = model.geom_pos[:, 2] + model.geom_size[:, 2]
@@ -174,6 +180,7 @@ def test_colours_span_the_heights_there_are_and_level_ground_is_checkered(pit):
     assert ((model.geom_matid >= 0) == (np.abs(tops) < 1e-6)).all()
 
 
+@pytest.mark.slow
 def test_steps_show_as_edges_without_shadows(camera_in_pit):
     """Along a column of pixels that sees the stairs brightness changes often and clearly: treads and risers."""
     picture = camera_in_pit.picture().astype(float).mean(axis=2)
@@ -181,6 +188,7 @@ def test_steps_show_as_edges_without_shadows(camera_in_pit):
     assert np.median(edges) >= 6
 
 
+@pytest.mark.slow
 def test_on_terrain_robots_are_where_they_are(camera_in_pit, pit):
     camera_in_pit.picture()
     bases = camera_in_pit.data.qpos.reshape(2, -1)[:, :3]
@@ -198,6 +206,7 @@ def test_the_camera_follows_the_chosen_robot(camera_in_pit, pit):
         assert middle.sum() > 0.5 * red(picture).sum()
 
 
+@pytest.mark.slow
 def test_feet_have_dark_spots_below_them(camera_in_pit, pit):
     camera_in_pit.picture()
     scene = camera_in_pit.renderer.scene

@@ -211,6 +211,7 @@ def test_sizes_by_difficulty(names, sizes):
         assert found == pytest.approx(sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TERRAIN_TYPES)
 @pytest.mark.parametrize("cell", [0.32, 0.5, 1.5, 5.0])
 def test_every_type_comes_to_an_end_on_coarse_cells(name, cell):

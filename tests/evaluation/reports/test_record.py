@@ -193,6 +193,7 @@ def test_a_run_is_compared_with_its_task_on_the_device_that_it_was_made_on():
     assert len(from_task_file(read_record(folder))) > len(found)
 
 
+@pytest.mark.slow
 def test_what_changed_in_a_few_words():
     folder = folder_of(**{"rewards.scales.torques": -1e-4, "train.runner.run_name": "cheap", "env.seed": 9})
     write_timing(folder, times())
