@@ -3,6 +3,7 @@
 import contextlib
 
 import mujoco
+import pytest
 import torch
 from helpers import CALM, ENGINE
 
