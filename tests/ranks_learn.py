@@ -15,9 +15,7 @@ from legged.learning.ppo import DevicePPO
 from legged.process.ranks import Ranks
 
 CASES = {
-    "plain": {},
-    "normalised": {"normalized": True},
-    "per mini-batch": {"normalize_advantage_per_mini_batch": True},
+    "normalised, per mini-batch": {"normalized": True, "normalize_advantage_per_mini_batch": True},
     "fixed rate": {"schedule": "fixed"},
     "symmetric": {"symmetry_cfg": MIRROR},
 }

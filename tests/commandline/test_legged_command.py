@@ -91,7 +91,7 @@ def test_python_m_legged_is_the_installed_command(tmp_path):
     script = tmp_path / "bin" / "legged"
     script.parent.mkdir()
     script.write_text("import sys\nfrom legged.cli.main import main\nsys.exit(main())\n")
-    for words in (["--help"], ["list", "tasks"], ["train", "--help"], ["runs", "no_folder"]):
+    for words in (["--help"], ["runs", "no_folder"]):
         given = ([sys.executable, "-m", "legged"], [sys.executable, str(script)])
         module, installed = (subprocess.run([*one, *words], capture_output=True, text=True, check=False) for one in given)
         assert (module.returncode, module.stdout, module.stderr) == (

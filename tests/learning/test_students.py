@@ -147,8 +147,8 @@ def test_the_loss_and_the_teacher_are_told(capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [[], ["--runner", "stock"], [*LSTM], [*LSTM, "--runner", "stock"], ["train.policy.obs_normalization=true"]],
-    ids=["captured", "stock", "lstm", "lstm, stock", "normalised"],
+    [["train.policy.obs_normalization=true"], ["--runner", "stock"], [*LSTM], [*LSTM, "--runner", "stock"]],
+    ids=["captured, normalised", "stock", "lstm", "lstm, stock"],
 )
 def test_two_and_two_iterations_are_four(settings):
     """Weights, moments and memory bit by bit, after the teacher's run has gone."""
