@@ -106,7 +106,7 @@ def reset_std(actor: MLPModel, cfg: TaskConfig) -> None:
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
     """Clamp a learned standard deviation to its bounds after each step of the optimiser.
 
-    rsl-rl clamps it only where it is used. A clamped parameter has no gradient, so it would never return to the bounds.
+    rsl-rl clamps it only where it is used. Outside the bounds the clamp has no gradient, so the parameter would never return.
     """
     distribution = actor.distribution
     if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:

@@ -100,7 +100,7 @@ class DevicePPO(CriticWarmup):
         return [*models, *moments, self._rate]
 
     def _why_stock(self) -> str:
-        """Return the first configured feature that only rsl-rl's own update supports; empty if there is none."""
+        """Return the first configured feature that only rsl-rl's own update supports, or an empty text."""
         if self.symmetry and self.symmetry.use_mirror_loss:
             return "a mirror loss"
         for name, model in (("actor", self.actor), ("critic", self.critic)):

@@ -234,7 +234,7 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
     """
     if checkpoint == BEST:
         if not (folder / BEST_MODEL).is_file():
-            keeping = "a training writes it if train.runner.evaluate_interval is set"
+            keeping = "with train.runner.evaluate_interval a training writes it"
             raise ConfigError(f"--checkpoint: {relative(folder)} has no {BEST_MODEL}; {keeping}")
         return folder / BEST_MODEL
     found = checkpoints(folder)
