@@ -62,7 +62,8 @@ class ConcurrentTerms:
         """Return the value of a term, and check that it reads no tensor of `settled`."""
         forbidden = ForbidReads(
             self._settled(),
-            "which a term with @concurrent reads too early: remove the mark, so that the term runs after check_termination",
+            "which is written after the terms with @concurrent: remove that mark, so that the term runs after"
+            " check_termination",
         )
         with forbidden:
             value = function()

@@ -95,7 +95,7 @@ def _observer(name: str, field: Field) -> Callable[[Any], Tensor]:
     def observe(self: Any) -> Tensor:
         draw = observed(self.cfg, name)
         if draw is None:
-            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not name it, so there is nothing to observe")
+            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not draw it, so there is nothing to observe")
         drawn = self.randomization.fields.get(name)
         if drawn is None:
             each = field.each if draw.each is None else draw.each

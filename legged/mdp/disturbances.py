@@ -36,7 +36,7 @@ class Kicks:
         place.
         """
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
-        """Distribution of each random column, and the value that its range grows from."""
+        """Distribution of each random column, and the value that its range starts from."""
         self._dt = dt
         self.time_left = time_left
         """(N,) time until the next kick [s]."""
@@ -68,7 +68,7 @@ class Forces:
         control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
         """
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
-        """Distribution of each random column, and the value that its range grows from."""
+        """Distribution of each random column, and the value that its range starts from."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
         """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) force now, world frame [N]."""
