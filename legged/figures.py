@@ -1,4 +1,4 @@
-"""Figures: how one is drawn into a file, and the colours that all of them share."""
+"""Figures: drawing into a file, and the colours that all figures share."""
 
 import os
 import re
@@ -20,13 +20,13 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#00
 are distinct for any colour vision. The last is their yellow, darkened for a white background.
 """
 STYLES = ("-", "--", "-.", ":")
-"""Line styles of curves that differ by more than their colours, in this order."""
+"""Line styles, in this order, for curves that colours alone do not tell apart."""
 DPI = 110
-"""Pixels an inch."""
+"""Pixels per inch."""
 
 
 def without_common_words(names: Sequence[str]) -> list[str]:
-    """Return labels without the words that all have in common: LF_FOOT and RF_FOOT become LF and RF. A name without other
+    """Return labels without the words that all names share: LF_FOOT and RF_FOOT become LF and RF. A name with only shared
     words stays whole.
     """
     words = [[word for word in re.split(r"[\W_]+", name) if word] for name in names]
@@ -35,7 +35,9 @@ def without_common_words(names: Sequence[str]) -> list[str]:
 
 
 def import_matplotlib() -> None:
-    """Import matplotlib, which takes a while, also under an MPLBACKEND that it does not know: figures are files here."""
+    """Import matplotlib, which takes a while. An unknown MPLBACKEND is ignored with a warning, because figures are only
+    written to files.
+    """
     if "matplotlib" in sys.modules:
         return
     backend = os.environ.pop("MPLBACKEND", None)
@@ -58,7 +60,7 @@ def figure(
     `path` as a PNG file. The file is written completely or not at all. Curves have the colours `COLORS`. With `share_y` all
     axes share one y scale. `saving` are options of matplotlib's savefig.
 
-    No window system is needed, whatever matplotlib's backend is (MPLBACKEND).
+    No window system is needed, even if MPLBACKEND names a backend that has windows.
 
     Raises:
         RunError: the file can't be written.

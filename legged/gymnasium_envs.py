@@ -21,19 +21,19 @@ from legged.registry import make_task, task_config
 from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
 Seen = Literal["actor", "dict"]
-"""Form of the observations: the policy's groups side by side, or a dictionary of all groups."""
+"""Form of the observations: the policy's groups joined in one array, or a dictionary of all groups."""
 SEEN = ("actor", "dict")
 RENDER_MODES = ["rgb_array"]
 REWARD = "reward_"
 """Prefix of the reward terms in infos."""
 LARGEST_SEED = 2**63
 LARGEST_PICTURE = 16384
-"""Largest side of a picture, a limit of graphics cards [pixels]."""
+"""Largest side of a picture [pixels]. It is a limit of graphics cards."""
 
 
 class _Driver:
-    """Shared part of both kinds of environment: a task that keeps the last step of every episode, its random numbers (tasks
-    draw from torch's generators, which are global to the process), its spaces and its camera.
+    """Shared part of both kinds of environment. It has a task that keeps the last step of every episode, the task's spaces
+    and camera, and its own random numbers, because tasks draw from torch's global generators.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}
@@ -76,10 +76,9 @@ class _Driver:
         with self._own_random_numbers():
             self.task: Any = make_task(cfg, self._device, graph=False)
             """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
-            # On a GPU the captured step includes the copies of final states; on the CPU the step needs no check for a
-            # capture.
+            # On a GPU the captured step includes the copies of final states. On the CPU it need not be checked for capture.
             self._final = keep_final_step(self.task, graph=self._device.type == "cuda")
-            # The initial state, with the buffers that terms create at their first call: a step is made and undone.
+            # One step is made and undone, because terms create buffers at their first call, which the initial state includes.
             before = self.task.state_dict()
             self.task.step(torch.zeros_like(self.task.actions))
             self._beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
@@ -87,7 +86,7 @@ class _Driver:
         self._seeded = False
         self._groups = None if observations == "dict" else groups_of(cfg, "actor")
         self._camera: ModelCamera | RobotsCamera | None = None
-        # One picture per step shows real time.
+        # With one picture per step, videos run in real time.
         self.metadata = {**type(self).metadata, "render_fps": max(1, round(1.0 / self.task.dt))}  # type: ignore[misc]
 
         def box(bound: float, width: int) -> spaces.Box:
@@ -116,7 +115,7 @@ class _Driver:
 
     def _reset(self, seed: int | None, options: dict[str, Any] | None, chosen: np.random.Generator) -> Any:
         """Start an episode in every environment and return the observations. A seed restores the initial state, curricula
-        included, and seeds the random numbers. Without one they continue; `chosen` draws the first seed.
+        included, and seeds the random numbers. Without a seed the random numbers continue. `chosen` draws the first seed.
         """
         if options:
             raise ConfigError(f"reset: options: the task has no options, got {shown(options)}")
@@ -197,7 +196,7 @@ class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
         return row(as_numpy(seen), 0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make a step with `action` (D,). Return the observation, the reward, whether the episode ended in a failure, whether
+        """Make a step with `action` (D,). Return the observation, the reward, True if the episode ended in a failure, True if
         its time ran out, and infos with the reward terms, `reward_<name>`.
 
         Raises:
@@ -220,7 +219,7 @@ class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
         Raises:
             RunError: this machine cannot render.
         """
-        if self._shows_the_next and self.render_mode is not None:  # restore the end of the episode: only a reset can follow
+        if self._shows_the_next and self.render_mode is not None:  # show the episode's end; only a reset can follow
             self.task.physics.write(torch.ones_like(self.task.reset_buf), self._final.qpos, self._final.qvel)
             self.task.sense()
             self._shows_the_next = False
@@ -234,7 +233,7 @@ class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
 
 class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
     """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
-    first observation of the next episode, and `infos["final_obs"]` has the last one of the old.
+    first observation of the next episode, and `infos["final_obs"]` has the last observation of the old episode.
     """
 
     metadata: ClassVar[dict[str, Any]] = {**_Driver.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
@@ -262,8 +261,9 @@ class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
         that ended in a failure and of those whose time ran out, and infos.
 
         Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
-        the last observations in `final_obs`. With NumPy `final_obs` is an array of N objects, None where no episode ended,
-        and is absent if none ended; with tensors it is (N, width), valid where the mask `_final_obs` is true.
+        the last observations in `final_obs`. With NumPy, `final_obs` is an array of N objects, None for environments whose
+        episode goes on. It is absent if no episode ended. With tensors it is (N, width), and valid where the mask
+        `_final_obs` is true.
 
         Raises:
             ValueError: the actions have another shape, or are not real numbers.

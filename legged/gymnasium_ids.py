@@ -1,7 +1,7 @@
 """Gymnasium ids of our tasks: `legged/<task>`.
 
-Gymnasium is not imported here. The ids are registered as soon as other code imports it. Gymnasium imports our classes by name
-when it makes an environment.
+This module does not import Gymnasium. The ids are registered as soon as other code imports Gymnasium, which imports our
+classes by name when it makes an environment.
 """
 
 import importlib.util
@@ -17,7 +17,7 @@ NAMESPACE = "legged"
 
 
 def announce(names: Callable[[], Iterable[str]]) -> None:
-    """Register the tasks that `names` returns: now, if Gymnasium is imported already, else when it is imported."""
+    """Register the tasks that `names` returns, now or as soon as Gymnasium is imported."""
     if "gymnasium" in sys.modules:
         add_ids(names())
     else:
@@ -27,8 +27,8 @@ def announce(names: Callable[[], Iterable[str]]) -> None:
 def add_ids(names: Iterable[str]) -> None:
     """Register these tasks, replacing earlier ids. Does nothing while Gymnasium is not imported.
 
-    Gymnasium refuses names with characters other than letters, digits and `_:.-`, and the names `x` and `x-v1` together. Such
-    a task gets no id.
+    Gymnasium refuses names with characters other than letters, digits and `_:.-`, and refuses `x` together with `x-v1`. A
+    refused task gets no id.
     """
     gymnasium = sys.modules.get("gymnasium")
     if gymnasium is None:
@@ -69,7 +69,7 @@ class _AtImport(MetaPathFinder):
 
 
 class _AndThen(Loader):
-    """Loader that runs another loader, then registers our tasks and removes the finder."""
+    """Loader that runs Gymnasium's loader, then registers our tasks and removes the finder."""
 
     def __init__(self, loader: Any, finder: _AtImport) -> None:
         self._loader, self._finder = loader, finder

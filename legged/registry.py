@@ -50,7 +50,7 @@ CLASSES = {
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """Task class; None takes the class of the configuration, or of the task that it extends."""
+    """Task class; None for the class that the configuration names, or else for that of the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
@@ -58,8 +58,8 @@ _REGISTERED: dict[str, _Entry] = {}
 
 def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[BaseTask] | None = None) -> None:
     """Register the task `name`. `config` is a YAML file, or a mapping with the same keys. `task_class` is a subclass of
-    LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), or that of the task it
-    extends, else LeggedRobot.
+    LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), else the class of the task
+    that it extends, else LeggedRobot.
 
     In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. The path of the
     file, and paths in a mapping, are relative to the folder of the calling module, else to the working directory.
@@ -139,7 +139,7 @@ def task_class(name: str) -> type[BaseTask]:
     """Return the class of a task.
 
     Raises:
-        ConfigError: no such task, or its configuration names a class that is not there.
+        ConfigError: the task does not exist, or its configuration names a class that does not exist.
     """
     for hint in class_hints(_entry(name), name, _REGISTERED):
         entry = _REGISTERED.get(hint.task or "")
@@ -151,7 +151,7 @@ def task_class(name: str) -> type[BaseTask]:
 
 
 def _class_named(kind: Any, where: str) -> type[BaseTask]:
-    """Return the task class of that name: one of ours, or one that a registered task has."""
+    """Return the task class named `kind`: a class of this package, or of a registered task."""
     registered = {entry.task_class.__name__: entry.task_class for entry in _REGISTERED.values() if entry.task_class}
     if isinstance(kind, str) and kind in registered and kind not in CLASSES:  # the names of our classes cannot be redefined
         return registered[kind]
@@ -167,7 +167,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
         ConfigError: `Config` is not a frozen dataclass that extends the schema of LeggedRobot or BaseTask.
     """
     base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
-    # The fields of an undecorated class would be ignored silently.
+    # Without the decorator, the fields of a class would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):
         raise ConfigError(
@@ -178,7 +178,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
 
 
 def task_schema(name: str) -> type[TaskConfig]:
-    """Return the schema of a task's configuration; that of a legged robot for a task that does not exist any more."""
+    """Return the schema of a task's configuration. For a task that does not exist any more, return that of a legged robot."""
     try:
         return _schema_of(task_class(name))
     except ConfigError:
@@ -248,7 +248,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
         try:
             size = size_of(robot)
         except ConfigError:
-            return data  # `check` reports the error, with the place that names the robot
+            return data  # `check` reports the error and the place that names the robot
         factor = partial(grown, reference=reference, robot=size)
         rescaled = rescale({key: value for key, value in data.items() if key != "cpu"}, schema, factor, unit_at)
         return rescaled | ({"cpu": rescale(data["cpu"], schema, factor, unit_at)} if "cpu" in data else {})
@@ -263,7 +263,7 @@ def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool =
         ConfigError: the configuration does not fit the engine, or the class does not call super().__init__.
         TermError: a term fails or cannot be captured.
     """
-    other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
+    other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may lack `terrain`
     kind: Any = task_class(cfg.task)
     with importing():
         task = kind(cfg, device, graph, **other_ground)

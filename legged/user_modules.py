@@ -1,4 +1,4 @@
-"""User-defined modules, which register tasks: import from a name or a file, and reports of their errors."""
+"""User-defined modules that register tasks: their import by name or file, and reports of their errors."""
 
 import importlib
 import importlib.util
@@ -13,7 +13,7 @@ from legged.process.paths import exists
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""
 _FOLDERS: set[str] = set()
-"""Folders that such modules were found in."""
+"""Folders in which such modules were found."""
 
 
 def run_module(name: str) -> None:
@@ -42,21 +42,21 @@ def run_module(name: str) -> None:
 
 
 def find_modules_in(folder: str) -> None:
-    """Add a folder to Python's search path, if it is missing. Python adds the working directory itself only if the program
-    was not called by its path.
+    """Add a folder to Python's search path, if it is missing. Python adds the working directory only for `python -m` and the
+    like, not for an installed program.
     """
     if folder not in sys.path:
         sys.path.insert(0, folder)
 
 
 def is_of_a_module(file: str) -> bool:
-    """Return whether a file of code lies in the folder of a module that was run, or below it."""
+    """Return True if a file of code lies in or below the folder of a module that was run."""
     path = Path(file)
     return any(path.is_relative_to(folder) for folder in _FOLDERS) and "site-packages" not in path.parts
 
 
 def _run(path: Path) -> None:
-    """Run a file as the module with its name.
+    """Run a file as the module with the file's name.
 
     Raises:
         ConfigError: another module with that name is loaded.
@@ -85,8 +85,8 @@ def _described(name: str, is_file: bool, folder: str, error: BaseException) -> C
 
 
 def _line(error: BaseException, folder: str) -> str:
-    """Return ' (file, line n)' of an error: the line that cannot be parsed, else the innermost line of a file in `folder`.
-    Return '' if there is no such line.
+    """Return ' (file, line n)' for an error: the line that cannot be parsed, or else the innermost line in a file in
+    `folder`. Return '' if there is no such line.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({error.filename}, line {error.lineno})"

@@ -25,18 +25,18 @@ class ActuatorConfig:
     joints: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints with this `model` and `network`; empty means all joints. Other joints have ideal motors."""
     stall_torque: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", positive(LARGEST)))
-    """Joint-name pattern -> torque of a blocked motor (dc_motor) [N m]; the effort limit of other joints."""
+    """Joint-name pattern -> torque of a blocked motor (dc_motor) [N m]; by default the joint's effort limit."""
     no_load_speed: dict[str, float] = field(default_factory=dict, metadata=quantity("rad/s", positive(LARGEST)))
-    """Joint-name pattern -> speed at which the motor gives no torque (dc_motor) [rad/s]; the velocity limit of other
-    joints."""
+    """Joint-name pattern -> speed at which the motor gives no torque (dc_motor) [rad/s]; by default the joint's velocity
+    limit."""
     armature: dict[str, float] = field(default_factory=dict, metadata=quantity("kg m^2", between(0, LARGEST)))
-    """Joint-name pattern -> inertia of rotor and gear about the joint, in any `model` [kg m^2]; the value in the robot's file
-    for other joints."""
+    """Joint-name pattern -> inertia of rotor and gear about the joint, in any `model` [kg m^2]; by default the value in the
+    robot's file."""
     coulomb_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", between(0, LARGEST)))
     """Joint-name pattern -> friction of a moving joint, independent of its speed [N m]; 0 for other joints."""
     breakaway_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m", between(0, LARGEST)))
-    """Joint-name pattern -> friction that a joint must overcome to begin to move (Stribeck) [N m]; the Coulomb friction of
-    other joints."""
+    """Joint-name pattern -> friction that a joint must overcome to begin to move (Stribeck) [N m]; by default the joint's
+    Coulomb friction."""
     stribeck_velocity: float = field(default=0.1, metadata=quantity("rad/s", positive(1000, low=1e-4)))
     """Speed at which friction has fallen by 63 % of the way from breakaway to Coulomb friction [rad/s]."""
     viscous_friction: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
@@ -44,7 +44,7 @@ class ActuatorConfig:
     friction_smoothing: float = field(default=0.1, metadata=quantity("rad/s", positive(1000, low=1e-4)))
     """Speed v0 below which Coulomb friction fades, as tanh(v / v0) [rad/s]."""
     delay: Steps = field(default=(0, 0), metadata=between(0, LONGEST_DELAY))
-    """Range of each robot's delay of targets, drawn at the start of an episode, in physics steps (sim.dt)."""
+    """Range of the delay of a robot's targets, in physics steps (sim.dt). The delay is drawn at the start of an episode."""
     delay_varies: bool = False
     """Draw each robot's delay in every control step. An older target never replaces a newer one."""
     network: str = ""

@@ -1,6 +1,7 @@
-"""Bounds of the schema's numbers. A value beyond them is a typing mistake, which would end in an overflow or fill the memory.
+"""Bounds of the schema's numbers. A value beyond them is a typing mistake and would overflow or fill the memory.
 
-Bounds hold for every item of a list and every value of a map. A list with bounds must not be empty, unless they allow it.
+Bounds hold for every item of a list and every value of a map. A list with bounds must not be empty, unless its bounds allow
+it.
 """
 
 from typing import Any
@@ -8,11 +9,11 @@ from typing import Any
 Bounds = dict[str, Any]
 
 FLOAT32_MAX = 3.4e38
-"""Largest number of any setting, because tensors are float32."""
+"""Largest number in any setting, because tensors are float32."""
 SMALLEST = 1e-9
 """Smallest value of a positive quantity, because many are divisors."""
 LONGEST_S = 1e9
-"""Longest time, for events that are never to happen [s]."""
+"""Longest time [s], long enough for an event that should never happen."""
 LARGEST = 1e6
 """Largest scale, gain or limit. Its square still fits float32."""
 
@@ -43,8 +44,8 @@ def rescaled(unit: str, bounds: Bounds) -> Bounds:
 
 
 def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
-    """Return metadata of a map term -> number. The numbers are rescaled by this power of the unit of the method
-    `<prefix><term>`.
+    """Return metadata of a map term -> number. When they are rescaled, the numbers have the unit of the method
+    `<prefix><term>`, raised to `power`.
     """
     return {**bounds, "unit_of": (prefix, power)}
 

@@ -91,7 +91,7 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, 
 def _build_entries(
     schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the sections in a map. Fields that a section lacks come from the default entry of its name, if there is one."""
+    """Build the sections in a map. If a section lacks a field, the default entry with the section's name gives it."""
     names = _check(dict[str, object], data, path, origins, source)  # `build` checks the values
     return {
         name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
@@ -199,7 +199,9 @@ def _number(value: float, fail: Any) -> float:
 
 
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
-    """Check a value in the free part of a configuration: anything that YAML can write and read, but finite numbers only."""
+    """Check a value in the free part of a configuration: anything that YAML can write and read, except NaN and infinite
+    numbers.
+    """
     if depth > DEEPEST:
         raise fail(f"at most {DEEPEST} nested maps and lists")
     if isinstance(value, Mapping):

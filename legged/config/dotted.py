@@ -14,7 +14,7 @@ MISSING = _Missing()
 
 
 def value_at(values: Any, path: str) -> Any:
-    """Return the value at a dotted path of nested mappings, or None without one."""
+    """Return the value at a dotted path of nested mappings, or None if there is no value."""
     for key in path.split("."):
         values = values.get(key) if isinstance(values, dict) else None
     return values
@@ -30,8 +30,8 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return dotted path -> its value in each configuration, for all settings that differ. The value is MISSING where a
-    configuration lacks the setting. An empty mapping counts only if it is empty or missing in every configuration.
+    """Return dotted path -> its value in each configuration, for all settings that differ. If a configuration lacks the
+    setting, the value is MISSING. An empty mapping counts only if it is empty or missing in every configuration.
     """
     all_flat = [flat(config) for config in configs]
     paths = dict.fromkeys(path for one in all_flat for path in one)

@@ -10,8 +10,8 @@ HIDDEN = items(64, between(1, 16384))
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """First part of a policy, which estimates quantities that only the simulator knows from the policy's observations. It is
-    trained by supervision in every iteration (Ji et al., arXiv 2202.05481). The policy reads the estimates in addition to its
+    """Estimator of quantities that only the simulator knows. It reads the policy's observations, and is trained by
+    supervision in every iteration (Ji et al., arXiv 2202.05481). The policy reads the estimates in addition to its
     observations.
     """
 
@@ -44,7 +44,7 @@ class PolicyConfig:
     init_noise_std: float = field(default=1.0, metadata=positive(1000, low=1e-6))
     """Standard deviation of the actions before training."""
     min_noise_std: float = field(default=1e-6, metadata=positive(1000, low=1e-6))
-    """Smallest standard deviation of the actions. It keeps up exploration where the entropy would collapse."""
+    """Smallest standard deviation of the actions. It keeps up exploration if the entropy would collapse."""
     max_noise_std: float = field(default=1e6, metadata=positive(1e6, low=1e-6))
     """Largest standard deviation of the actions."""
     noise_std_type: Literal["scalar", "log"] = "scalar"
@@ -60,7 +60,7 @@ class PolicyConfig:
     rnn_num_layers: int = field(default=1, metadata=between(1, 64))
     """Number of recurrent layers."""
     estimator: EstimatorConfig = EstimatorConfig()
-    """Estimator, the first part of the policy."""
+    """Estimator whose outputs the policy reads."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class AlgorithmConfig:
     symmetry: bool = False
     """Learn from every sample and its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
     mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
-    """Weight of the mirror loss, with symmetry: the difference between the actions for a mirror image and the mirrored
-    actions; 0 for none."""
+    """Weight of the mirror loss, with symmetry: the difference between the actions for a mirrored observation and the
+    mirrored actions; 0 for none."""
     critic_warmup_iterations: int = field(default=0, metadata=between(0, 1_000_000_000))
     """Number of iterations at the start in which the value function learns alone. The policy, its standard deviation and its
     normaliser stay constant. `--transfer` then takes the policy alone, with a new value function, optimiser and standard
@@ -145,29 +145,29 @@ class RunnerConfig:
     num_steps_per_env: int = field(default=24, metadata=between(1, 100_000))
     """Control steps of each robot per iteration."""
     max_iterations: int = field(default=1500, metadata=between(1, 1_000_000_000))
-    """Iterations of the whole training. A resumed run continues up to this number."""
+    """Number of iterations of the whole training. A resumed run continues up to this number."""
     save_interval: int = field(default=50, metadata=between(1, 1_000_000_000))
     """Iterations between two checkpoints."""
     evaluate_interval: int = field(default=0, metadata=between(0, 1_000_000_000))
     """Iterations between two evaluations during training; 0 for none. They measure the policy without exploration, on
     separate robots without disturbances."""
     evaluate_share: float = field(default=0.03, metadata=UNIT)
-    """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed it is
-    skipped, except the first and the last; 1 skips none."""
+    """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed this
+    share is skipped, except the first and the last; 1 skips none."""
     evaluate_envs: int = field(default=256, metadata=between(1, 2**20))
     """Largest number of robots of an evaluation during training. The commands of the task's grid are distributed over
     them."""
     evaluate_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
     """Simulated time of an evaluation during training [s]; 0 for 3 s, or a whole episode in tasks without commands."""
     best_by: str = ""
-    """Figure of the evaluations during training that selects model_best.pt; empty for lin_vel_rmse, or the return in tasks
-    without commands."""
+    """Figure of the evaluations during training that selects model_best.pt; empty for lin_vel_rmse, or for the return in
+    tasks without commands."""
     stop_at: dict[str, float] = field(default_factory=dict, metadata=between(-1e12, 1e12))
     """Figure of the evaluations during training -> its target. Training ends when all targets are reached. Falls and figures
     ending in _rmse must be at most their target, others at least."""
     loop: Literal["stock", "captured"] = "captured"
-    """Training loop. `captured`: rsl-rl's arithmetic without the host, as CUDA graphs on a GPU; where networks or algorithm
-    need it, `stock` replaces it, with a message. `stock`: rsl-rl's own training loop."""
+    """Training loop. `captured`: rsl-rl's arithmetic without the host, as CUDA graphs on a GPU; if networks or algorithm need
+    it, `stock` runs instead, with a message. `stock`: rsl-rl's own training loop."""
     matmul: Literal["float32", "tf32"] = "tf32"
     """Precision of matrix products during training. On a GPU `tf32` keeps 10 of the factors' 23 bits, which is faster. On a
     CPU it selects the fastest library that keeps all bits."""

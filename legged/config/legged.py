@@ -53,12 +53,12 @@ class TerrainConfig:
     """Move robots to harder rows while they succeed. Without it, every row has a random high difficulty, and robots stay in
     their row."""
     scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "rescaled": "m"})
-    """Factor on all lengths of the terrain types; 1 suits a robot half a metre high."""
+    """Factor on all lengths of the terrain types; 1 suits a robot that is half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; the shares sum to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
     sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes", positive(100)))
-    """Terrain type -> size of all its tiles in the type's unit, or [low, high]. Sizes then change evenly from the easier one
-    in the first row to the harder one at difficulty 1. This replaces the type's own sizes."""
+    """Terrain type -> size of all its tiles in the type's unit, or [low, high]. With two sizes, they change evenly from the
+    easier one in the first row to the harder one at difficulty 1. An entry replaces the type's default sizes."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
     """Number of rows. The difficulty of a row is row / num_rows."""
     num_cols: int = field(default=20, metadata=between(1, 1000))
@@ -72,7 +72,7 @@ class TerrainConfig:
     horizontal_scale: float = field(default=0.1, metadata=rescaled("m", positive(10, low=1e-3)))
     """Edge length of a cell of the height map [m]."""
     slope_threshold: float = field(default=0.2, metadata=between(0, 1000))
-    """Slope (rise over run) above which a difference between cells becomes a vertical face, in types made of steps."""
+    """Slope (rise over run) above which two neighbouring cells get a vertical face between them, in types made of steps."""
     max_init_terrain_level: int = field(default=5, metadata=between(0, 999))
     """Highest row in which robots start the training."""
     spawn_range: float = field(default=1.0, metadata=rescaled("m", between(0, 1000)))
@@ -82,8 +82,8 @@ class TerrainConfig:
     measured_points_y: tuple[float, ...] = field(default=tuple(round(0.1 * i - 0.5, 1) for i in range(11)), metadata=MEASURED)
     """Positions of the measured heights, to the left of the base [m]."""
     scan: Literal["lowest", "own", "highest"] = "lowest"
-    """Value that a measured point reads from the height map: the `lowest` of its cell and the next ones in x and y, as in
-    legged_gym; the height of its `own` cell; or the `highest` of the three."""
+    """Value that a measured point reads from the height map: the `lowest` of its cell and the next cells in x and y, as in
+    legged_gym; the height of its `own` cell; or the `highest` of these three."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class CommandsConfig:
     resampling_time_s: float = field(default=10.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time for which a command is held [s]."""
     heading_command: bool = True
-    """Sample a heading and compute the yaw rate 0.5 * wrap(heading - yaw) at every step."""
+    """Sample a heading instead of a yaw rate, and command the yaw rate 0.5 * wrap(heading - yaw) at every step."""
     small_command: float = field(default=0.2, metadata=quantity("m/s", between(0, 100)))
     """Norm below which a sampled horizontal velocity is set to zero [m/s]."""
     standing_share: float = field(default=0.0, metadata=UNIT)
@@ -164,7 +164,7 @@ class LeggedControlConfig(ControlConfig):
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of joints without an action (P). Their motors hold the default angle with their own gains."""
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
-    """Differences of the motors from ideal ones: torque limits over speed, friction, delay, learned actuators."""
+    """Properties of motors that are not ideal: torque limits over speed, friction, delay, learned actuators."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """Terms that count as failures. `contact`: one of the robot's `terminate_after_contacts_on` shapes feels more than 1 N,
     or 1 % of a weight below 100 N. `base_height` and `tilt`: the limits below."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
-    """Terms that count as time-outs. `left_terrain`: the robot left the map, which is not its failure."""
+    """Terms that count as time-outs. `left_terrain`: the robot left the map, which does not count as a failure."""
     min_base_height: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Lowest height of the base above the ground [m]; 0 switches `base_height` off."""
     max_tilt: float = field(default=0.0, metadata=quantity("rad", between(0, 10)))
@@ -189,8 +189,8 @@ class LeggedDomainRandConfig(DomainRandConfig):
     randomize_friction: bool = True
     """Randomise the friction of each robot's contacts."""
     friction_range: Range = field(default=(0.5, 1.25), metadata=between(0, 100))
-    """Range of the contacts' Coulomb friction. PhysX averages foot and ground; MuJoCo takes the foot's, which has
-    priority."""
+    """Range of the contacts' Coulomb friction. PhysX averages foot and ground. MuJoCo takes the foot's friction, because the
+    foot has priority."""
     friction_buckets: int = field(default=64, metadata=between(1, 1_000_000))
     """Number of different friction values."""
     randomize_base_mass: bool = False
@@ -214,7 +214,7 @@ class LeggedDomainRandConfig(DomainRandConfig):
 
     def nominal(self) -> Self:
         plain = super().nominal()
-        by_flag: dict[str, Range | DrawConfig] = {}  # evaluation switches these two off by their flags
+        by_flag: dict[str, Range | DrawConfig] = {}  # evaluation switches these two off by flags
         if self.randomize_friction:
             by_flag["friction"] = self.friction_range
         if self.randomize_base_mass:
@@ -249,7 +249,7 @@ class LeggedRewardsConfig(RewardsConfig):
     """Width of the tracking rewards exp(-error^2 / sigma)."""
     air_time_target_s: float = field(default=0.5, metadata=rescaled("s", between(0, 100)))
     """Target of the swing time [s]. feet_air_time rewards longer swings and punishes shorter ones; single_stance is largest
-    at it."""
+    at this time."""
     feet_clearance_target: float = field(default=0.1, metadata=rescaled("m", between(0, 100)))
     """Height of a swinging foot above the lowest foot that feet_clearance rewards [m]."""
     base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))

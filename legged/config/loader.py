@@ -24,16 +24,17 @@ OF_FILES = ("extends", "class", "written_for", "cpu")
 
 @dataclass(frozen=True)
 class Registered:
-    """Configuration that outside code registered: a file, or a mapping with the same keys."""
+    """Configuration that user-defined code has registered: a file, or a mapping with the same keys."""
 
     config: Path | Mapping[str, Any]
     folder: Path
-    """Folder of that code, to which the paths in a mapping are relative."""
+    """Folder of that code. Paths in a mapping are relative to it."""
 
 
 Source = Path | Mapping[str, Any] | Registered
 Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
-"""Function: (data of a layer, its reference robot, the task's robot, beginning of errors) -> data for the task's robot."""
+"""Function: (data of a layer, the layer's reference robot, the task's robot, beginning of errors) -> data for the task's
+robot."""
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
@@ -151,11 +152,11 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Merge layers. A value of the nearest file replaces those of files that it extends. On a CPU, the `cpu:` section of each
+    """Merge layers. A value in a file replaces the values in the files that it extends. On a CPU, the `cpu:` section of each
     layer is merged on top of it.
 
-    Each layer is checked separately, so that a later one can't hide a mistake. Numbers of a layer with a reference robot are
-    rescaled for `robot`, or if None, for the robot that the layers name.
+    Each layer is checked separately, so that a later layer can't hide a mistake. Numbers of a layer with a reference robot
+    are rescaled for `robot`, or if `robot` is None, for the robot that the layers name.
 
     Raises:
         ConfigError: a layer does not fit the schema.
@@ -181,7 +182,7 @@ def _merged(
             if not isinstance(layer.reference_robot, str):
                 raise ConfigError(f"{where}: expected the name of a robot, got {shown(layer.reference_robot)}")
             rescaled: Mapping[str, Any] = data
-            if rescale is not None and isinstance(robot, str):  # a wrong type of `robot` is refused later
+            if rescale is not None and isinstance(robot, str):  # a `robot` of a wrong type is refused later
                 reference = robot_path(layer.reference_robot, layer.folder)
                 rescaled = rescale(data, reference, robot, where)
                 origins.reference_robots = tuple(dict.fromkeys([*origins.reference_robots, reference]))
@@ -205,7 +206,7 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
     """Check that a layer and its `cpu:` section fit the schema. The section is checked on a GPU machine too.
 
     Raises:
-        ConfigError: it does not fit.
+        ConfigError: the layer or the section does not fit.
     """
     known = {*OF_FILES, *(field.name for field in dataclasses.fields(schema) if field.compare)}
     for key in data:
@@ -223,8 +224,8 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
-    """Return the setting `robot` of a file in `folder`, as an absolute path if it is a path: a folder next to the file or in
-    the working directory, or a text with a slash or a leading dot. Names of robots under resources/robots/ are returned
+    """Return the setting `robot` of a file in `folder`. A path becomes absolute. It is a path if it has a slash or a leading
+    dot, or names a folder next to the file or in the working directory. Names of robots under resources/robots/ are returned
     unchanged.
     """
     if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
@@ -297,7 +298,7 @@ def load_config(
 def _merge_overrides(
     data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins, schema: type[TaskConfig]
 ) -> None:
-    """Merge overrides of the command line into `data`. Each is checked separately, so that a later one can't hide a
+    """Merge overrides of the command line into `data`. Each override is checked separately, so that a later one can't hide a
     mistake.
     """
     for key, value in overrides:
@@ -318,8 +319,8 @@ def from_dict(
     source: str = "config",
     schema: type[TaskConfig] = LeggedConfig,
 ) -> TaskConfig:
-    """Build an instance of `schema` from nested plain values. `origins` has the sources of the values, if they are not all
-    from `source`.
+    """Build an instance of `schema` from nested plain values. `origins` gives the sources of the values if not all are from
+    `source`.
     """
     if origins is None:
         data = renamed(data, source)

@@ -23,9 +23,9 @@ class TerminationsConfig:
     """Terms `_terminate_<name>` that end an episode, in addition to its length and NaN or infinite numbers."""
 
     failures: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Terms that end an episode as a failure, with no value after it."""
+    """Terms that end an episode as a failure. The learner expects no reward after it."""
     time_outs: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Terms that end an episode as a time-out. The learner bootstraps the value after it."""
+    """Terms that end an episode as a time-out. The learner bootstraps the value of the last state."""
 
 
 @dataclass(frozen=True)

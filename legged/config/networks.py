@@ -31,7 +31,7 @@ def learns_from_teacher(cfg: TaskConfig) -> bool:
 
 
 def check_networks(cfg: TaskConfig) -> None:
-    """Check the networks against the observations, each other's settings and the learner.
+    """Check that the networks fit the observations, each other and the learner.
 
     Raises:
         ConfigError: a network reads an unknown group; the initial standard deviation is out of bounds; a mirror loss lacks
@@ -67,8 +67,8 @@ def _check_estimator(cfg: TaskConfig) -> None:
     """Check an estimator against the other settings.
 
     Raises:
-        ConfigError: it has outputs but no targets, the name of its group is taken, or a setting needs rsl-rl's own update,
-            which has no estimator.
+        ConfigError: the estimator has outputs but no targets, the name of its group is taken, or a setting needs rsl-rl's own
+            update, because that update has no estimator.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     path = "train.policy.estimator.targets"
@@ -98,8 +98,8 @@ def _check_student(cfg: TaskConfig) -> None:
     """Check a student against the settings of distillation.
 
     Raises:
-        ConfigError: it has a learned standard deviation or an estimator, or its gradient_length does not divide the steps of
-        an iteration.
+        ConfigError: the student has a learned standard deviation or an estimator, or gradient_length does not divide the
+            steps of an iteration.
     """
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:
@@ -120,7 +120,7 @@ def _check_recurrent(cfg: TaskConfig) -> None:
     """Check a recurrent policy against the settings of the learner.
 
     Raises:
-        ConfigError: it is to learn from mirror images, or has fewer robots than mini-batches.
+        ConfigError: the policy is to learn from mirror images, or there are fewer robots than mini-batches.
     """
     kind, algorithm, origins = cfg.train.policy.rnn_type, cfg.train.algorithm, cfg.origins
     recurrent = f"a recurrent policy (train.policy.rnn_type={kind}, {origins.of('train.policy.rnn_type')})"

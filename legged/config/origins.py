@@ -15,18 +15,16 @@ class Origins(dict[str, str]):
         """Sources whose numbers were rescaled from a reference robot (rescale.py)."""
 
     def note(self, path: str, source: str) -> None:
-        """Record that `source` set `path`, and remove the entries that it replaces: those of its parents and of its
-        children.
-        """
+        """Record that `source` set `path`, and remove the entries of the path's parents and children."""
         for old in [key for key in self if key.startswith(f"{path}.") or path.startswith(f"{key}.")]:
             del self[old]
         self[path] = source
 
     def of(self, path: str) -> str:
-        """Return the source of `path`, 'the default' if it has none. For a section, return all sources that set one of its
-        keys.
+        """Return the source of `path`, or 'the default' if no source is recorded. For a section, return all sources that set
+        one of its keys.
 
-        The source of a list's item, `path[2]`, is that of the list.
+        The source of an item of a list, `path[2]`, is the source of the list.
         """
         path = path.partition("[")[0]
         found = [source for key, source in self.items() if key == path or key.startswith(f"{path}.")]

@@ -31,8 +31,8 @@ class DrawConfig:
     """Draw a value for each part that has the property (joint, body, shape), or one for the whole robot; null for the
     property's default."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """Iterations between which the range grows to its full width; [0, 0] for the full width at once. It grows from the
-    property's neutral value, or from the nearest end if that value is outside the range."""
+    """First and last iteration of the range's widening; [0, 0] for the full width at once. The range starts from the
+    property's neutral value, or from its nearest end if that value is outside the range."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +54,19 @@ class KickConfig:
     yaw: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
     """Range of the change about the base's z axis, base frame [rad/s]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """Iterations between which kicks grow from zero to their full ranges; [0, 0] for the full ranges at once."""
+    """First and last iteration in which the ranges widen from zero; [0, 0] for the full ranges at once."""
 
 
 @dataclass(frozen=True)
 class ForceConfig:
-    """Force on a body of the robot, repeated and temporary."""
+    """Temporary force on a body of the robot, at random intervals."""
 
     body: str = ""
     """Body of the robot's model; empty is the base."""
     interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Range of the time from the end of a robot's push to its next one, drawn after each push [s]."""
+    """Range of the time from the end of a push to the robot's next push, drawn for each push [s]."""
     duration_s: Range = field(default=(0.1, 0.5), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Range of the duration, rounded to whole control steps, at least one [s]."""
+    """Range of a push's duration [s]. It is rounded to whole control steps, at least one."""
     x: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Range of the force along x at the body's centre of mass, world frame [N]."""
     y: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
@@ -74,7 +74,7 @@ class ForceConfig:
     z: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Range of the force along z, world frame [N]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """Iterations between which forces grow from zero to their full ranges; [0, 0] for the full ranges at once."""
+    """First and last iteration in which the ranges widen from zero; [0, 0] for the full ranges at once."""
 
 
 def draw_of(entry: Range | DrawConfig) -> DrawConfig:

@@ -1,4 +1,4 @@
-"""Text of the schema: path, type, default, unit, bounds and meaning of every field, for the reference and for completion."""
+"""Descriptions of the schema's fields for the reference and for completion: path, type, default, unit, bounds and meaning."""
 
 import ast
 import dataclasses
@@ -25,7 +25,7 @@ class FieldText:
     kind: str
     """Accepted values, such as "a number" or "one of P, V, T"."""
     default: Any
-    """Default as plain values; None for a section, whose fields have their own."""
+    """Default as plain values; None for a section, because its fields have defaults."""
     unit: str
     """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty without one, or if each entry has its own."""
     bounds: str

@@ -1,8 +1,7 @@
 """Rescaling of a configuration's numbers from its reference robot to another robot, by dynamic similarity.
 
-The fields define the unit of each number. `rescaled` (bounds.py) gives a field its unit. Scales and noise of a term follow
-from the unit that `@unit` declares for it. Sizes of terrain types and ranges of randomised properties follow from the unit of
-each entry.
+The fields define the unit of each number. `rescaled` (bounds.py) gives a field its unit. For scales and noise of a term,
+`@unit` declares the unit. Each size of a terrain type and each range of a randomised property has the unit of its entry.
 """
 
 import dataclasses
@@ -13,10 +12,10 @@ from typing import Any
 from legged.config.checks import hints_of
 
 Factor = Callable[[str], float]
-"""Function: unit -> factor by which a quantity of that unit grows from one robot to the other."""
+"""Function: unit -> factor on a quantity of that unit, from the reference robot to the other robot."""
 UnitOf = Callable[[str], str]
 """Function: name of a term's method, such as "_reward_torques", or dotted path of an entry, such as "terrain.sizes.step" ->
-its unit."""
+unit."""
 DIGITS = 6
 """Significant digits of a rescaled number, few enough to read."""
 

@@ -16,14 +16,14 @@ class HeightMapConfig:
     shift: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Half width of the map's displacement along each horizontal world axis, drawn for each episode [m]."""
     drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
-    """Half width of the speed at which `offset` grows, drawn for each episode [m/s]."""
+    """Half width of the speed at which the heights' common error drifts, drawn for each episode [m/s]."""
     shift_drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
-    """Half width of the speed at which `shift` grows along each axis, drawn for each episode [m/s]."""
+    """Half width of the speed at which the map's displacement drifts along each axis, drawn for each episode [m/s]."""
     holes: float = field(default=0.0, metadata=between(0, 1))
     """Share of the points that the map lacks, drawn for each episode. Such a point reads 0, like level ground under a robot
     whose base is `heights_offset` high."""
     lost: float = field(default=0.0, metadata=between(0, 1))
-    """Share of the robots without a map, drawn for each episode, which must walk blindly. Success on terrain is measured with
+    """Share of the robots that have no map and must walk blindly, drawn for each episode. Success on terrain is measured with
     robots that have a map."""
 
 

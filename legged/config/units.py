@@ -1,4 +1,4 @@
-"""Physical units as texts, and the growth of quantities with the size of a robot."""
+"""Physical units as texts, and the scaling of quantities with the size of a robot."""
 
 import re
 from collections.abc import Mapping
@@ -26,8 +26,8 @@ TOKENS = re.compile(r"[A-Za-z]+|\^-?\d+|\S")
 
 
 def exponents(unit: str) -> Exponents:
-    """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2". Of several units,
-    separated by commas, the first counts. A text that is not a unit gives (0, 0, 0).
+    """Return the exponents of mass, length and time of a unit such as "N^2 m^2", "rad/s^2" or "(m/s)^2". If there are several
+    units, separated by commas, the first counts. A text that is not a unit gives (0, 0, 0).
     """
     return _parsed(unit.partition(",")[0]) or (0, 0, 0)
 
@@ -67,8 +67,8 @@ def _product(words: list[str]) -> Exponents | None:
 
 
 def factor(unit: str, scale: Mapping[str, float]) -> float:
-    """Return the growth factor of a quantity of this unit if masses, lengths and times grow by scale["kg"], ["m"] and
-    ["s"].
+    """Return the factor on a quantity of this unit if masses, lengths and times are multiplied by scale["kg"], scale["m"] and
+    scale["s"].
     """
     mass, length, time = exponents(unit)
     return float(scale["kg"] ** mass * scale["m"] ** length * scale["s"] ** time)

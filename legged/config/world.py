@@ -18,7 +18,7 @@ class EnvConfig:
     """Time-out of an episode [s]."""
     seed: int = field(default=1, metadata=between(0, 2**62))
     """Seed of torch's generators and of the terrain. Physics uses no random numbers. With several GPUs, the robots of each
-    have the seed + rank."""
+    GPU have the seed plus its rank."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class SimConfig:
     or `auto`. `auto` takes mujoco_warp on a GPU, and on a CPU for 256 robots or more if its fused step supports the model;
     otherwise the C engine."""
     solver: NewtonSolver = "mujoco"
-    """Solver of `newton`; other engines have their own. Each solver has settings with which a quadruped stands:
-    legged/physics/newton/solvers.py."""
+    """Solver of `newton`; other engines have their own. legged/physics/newton/solvers.py has, for each solver, settings with
+    which a quadruped stands."""
     dt: float = field(default=0.005, metadata=quantity("s", positive(0.1, low=1e-5)))
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
@@ -50,8 +50,8 @@ class SimConfig:
     does not fit is an error. `auto`: `fused` where the model fits; else fused contact forces where those fit (60 degrees of
     freedom)."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
-    """Contacts allocated per robot in mujoco_warp and newton. The libraries' own collision launches share them among all
-    robots, and also use some for shapes that are only close to each other."""
+    """Contacts allocated per robot in mujoco_warp and newton. The libraries' own collision launches share the contacts among
+    all robots, and also use some for shapes that are close but do not touch."""
     njmax: int = field(default=96, metadata=between(1, 10_000))
     """Constraint rows allocated per robot in mujoco_warp and in Newton's MuJoCo solver: 4 per contact in the pyramidal cone,
     1 per joint limit."""

@@ -33,7 +33,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node as the parser does. Refuse deep nesting, through which the parser would recurse without limit."""
+        """Compose a node as the parser does, but refuse deep nesting, because the parser would recurse without limit."""
         self._depth = getattr(self, "_depth", 0) + 1
         if self._depth > DEEPEST:
             raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} nested blocks", problem_mark=self.get_mark())
@@ -63,7 +63,9 @@ class _Loader(yaml.SafeLoader):
         return size, depth
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Refuse a repeated key. This happens before merge keys are expanded, because a block may override those."""
+        """Refuse a repeated key. This happens before merge keys are expanded, because a block may override the keys that it
+        merges.
+        """
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):

@@ -10,8 +10,8 @@ from torch import Tensor
 
 @contextmanager
 def ordinary_tensors() -> Iterator[None]:
-    """Run the block without recording gradients and without inference mode, even if the caller uses it. An inference tensor
-    that a term keeps from one step could not be written outside inference mode in a later step.
+    """Run the block without recording gradients and without inference mode, even if the caller uses it. A term may keep a
+    tensor from one step to the next, and a tensor made in inference mode could not be written later.
     """
     with torch.inference_mode(False), torch.no_grad():
         yield
@@ -21,7 +21,7 @@ def as_actions(actions: Any, num_envs: int, num_actions: int) -> Tensor:
     """Return `actions` as a tensor (N, D) of real numbers.
 
     Raises:
-        ValueError: they are not real numbers, or have another shape.
+        ValueError: the actions are not real numbers, or have another shape.
     """
     wanted = f"actions: expected real numbers of shape (N, D) = ({num_envs}, {num_actions})"
     try:

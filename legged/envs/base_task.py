@@ -1,7 +1,7 @@
 """Base class of all tasks: the loop of a Markov decision process on batched physics, behind rsl-rl's interface.
 
-Terms are methods: `_obs_<name>`, `_reward_<name>`, `_terminate_<name>`, `_metric_<name>`. The configuration names the ones
-that run. All tensors have N rows, one per environment, and stay at their addresses, so that a step is one CUDA graph.
+Terms are methods: `_obs_<name>`, `_reward_<name>`, `_terminate_<name>`, `_metric_<name>`. Those that the configuration names
+run. All tensors have N rows, one per environment, and stay at their addresses, so that a step is one CUDA graph.
 """
 
 from abc import abstractmethod
@@ -44,14 +44,14 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     QUANTITIES: ClassVar[tuple[str, ...]] = ()
     """Arrays of MuJoCo's data, in addition to qpos and qvel, that terms read by `self.physics.quantity(name)`."""
     OWN_HELPERS: ClassVar[tuple[str, ...]] = ()
-    """Methods that a subclass calls itself although they are named like a hook of another framework. Such a name is an error
-    otherwise, because BaseTask never calls it (legged/envs/class_checks.py)."""
+    """Methods with the name of another framework's hook that a subclass calls itself. Without this entry the name is an
+    error, because BaseTask never calls that hook (legged/envs/class_checks.py)."""
 
     def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
         """Build physics and terms on `device`; with `graph`, the step is captured on a GPU.
 
         Raises:
-            ConfigError: the configuration names something that does not exist; nothing is compiled then.
+            ConfigError: the configuration names something that does not exist. Nothing has been compiled yet.
             TermError: a term fails or cannot be captured.
         """
         self.check(cfg)
@@ -65,7 +65,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Control step [s]."""
         self.max_episode_length = round(cfg.env.episode_length_s / cfg.dt)
         """Steps of a full episode."""
-        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # each GPU has other robots, on the same ground
+        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # each GPU simulates other robots, on the same ground
         self.randomization = self.make_randomization()
         self._build_physics(self.make_scene())
         self.num_actions = self.physics.ctrl.shape[1]
@@ -76,7 +76,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
         self._collect_terms()
         self.numbers.allocate()
-        # An engine that cannot be captured runs eagerly on a GPU. On the CPU the step is only checked.
+        # On a GPU, the step of an engine that can't be captured runs eagerly. On the CPU the step is only checked.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
 
     @classmethod
@@ -90,7 +90,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     @classmethod
     def terms(cls, prefix: str) -> set[str]:
-        """Return the names of the methods that begin with `prefix`, without it."""
+        """Return the names of the methods that begin with `prefix`, with the prefix removed."""
         return {name.removeprefix(prefix) for name in dir(cls) if name.startswith(prefix)}
 
     @abstractmethod
@@ -114,8 +114,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """(N,) True if the episode ended, by failure or time-out."""
         self.valid = torch.ones_like(self.terminated_buf)
         """(N,) True for environments whose numbers are finite and in bounds: state and actions of this step, rewards and
-        observations of the previous step. The others are terminated and reset.
-        """
+        observations of the previous step. All other environments are terminated and reset."""
         self.reset_qpos = torch.zeros_like(self.physics.qpos)
         """(N, nq) generalised positions at the beginning of each environment's next episode."""
         self.reset_qvel = torch.zeros_like(self.physics.qvel)
@@ -142,7 +141,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self._has_buffers = False
 
     def _init_buffers(self) -> None:
-        """Hook: allocate a subclass' own tensors and parts. Called when the physics is built and no term has run yet.
+        """Hook: allocate a subclass' own tensors and parts. It is called after the physics is built and before any term runs.
         Overrides must call super()._init_buffers().
         """
         self._has_buffers = True
@@ -152,7 +151,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         cfg = self.cfg
         self._collect_judgements()
         groups = groups_in(cfg)
-        # Terms of the largest group come first, so that this group reads adjacent columns.
+        # The terms of the largest group come first, so that this group's columns are adjacent.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
         self.observation_terms.errors = self.make_observation_errors()
@@ -168,11 +167,11 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         return list(self.cfg.terminations.failures), list(self.cfg.terminations.time_outs)
 
     def _build_graph(self, enabled: bool) -> None:
-        """Capture the step on a GPU, or check on the CPU that it could be captured; then reset all episodes."""
+        """Capture the step on a GPU, or check on the CPU that a graph could hold it. Then reset all episodes."""
         with ordinary_tensors():
             before = self.state_dict()
             self._graph = StepGraph(self._step, self.device, enabled)  # type: ignore[arg-type]
-            # Undo the trial steps, except for buffers that a term has allocated at its first call.
+            # Undo the trial steps, but keep the buffers that terms allocated at their first call.
             now = self.state_dict()
             self.load_state_dict({part: {**state, **before[part]} for part, state in now.items()})
             self.reset_curricula()
@@ -233,8 +232,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Hook: update `physics.ctrl` before each physics step, for control laws that run faster than the policy."""
 
     def draw(self) -> None:
-        """Hook: draw the noise of the step, and initial states of every environment, which only the reset ones use. Runs on a
-        parallel stream of the step.
+        """Hook: draw the noise of the step and an initial state for every environment. Only environments that are reset use
+        it. The hook runs on a parallel stream of the step.
         """
         self.numbers.draw()
         self.randomization.draw()
@@ -242,10 +241,12 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     @abstractmethod
     def draw_reset(self) -> None:
-        """Write an initial state for every environment to `reset_qpos` and `reset_qvel`. `numbers` have just been drawn."""
+        """Write an initial state for every environment to `reset_qpos` and `reset_qvel`. When this runs, `numbers` have just
+        been drawn.
+        """
 
     def sense(self) -> None:
-        """Hook: update all tensors that follow from the state of the physics."""
+        """Hook: update all tensors that are computed from the state of the physics."""
         self.physics.refresh()
 
     def advance(self) -> None:
@@ -263,8 +264,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def _settle_endings(self) -> None:
-        """Derive failures and time-outs from `reset_buf`, which an override of `check_termination` may have written, as
-        legged_gym's do. An episode that ends and is not timed out has failed.
+        """Derive failures and time-outs from `reset_buf`, because an override of `check_termination` may write only
+        `reset_buf`, as in legged_gym. An episode that ends without a time-out has failed.
         """
         self.time_out_buf.logical_and_(self.reset_buf)
         torch.gt(self.reset_buf, self.time_out_buf, out=self.terminated_buf)
@@ -279,8 +280,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.forget(mask)
 
     def forget(self, mask: Tensor) -> None:
-        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. Runs at the same time as
-        `redraw`, so it must not read randomised properties; `reset_idx` can, after super().reset_idx(mask).
+        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. The hook runs at the same time as
+        `redraw`, so it must not read randomised properties. `reset_idx` may read them, after super().reset_idx(mask).
         """
         self.rewards.reset(mask)
         masked_set_(self.actions, mask, 0.0)
@@ -348,9 +349,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Make one control step of all environments under `actions` (N, D): a tensor on any device, an array or a list of
         real numbers. The step records no gradients, even if the caller does.
 
-        Returns observations, rewards (N,), dones (N,) bool, and extras with `time_outs` (N,) bool and, once per rollout,
-        `log`:
-        means over the rollout as 0-dimensional tensors.
+        Returns observations, rewards (N,), dones (N,) bool, and extras. The extras hold `time_outs` (N,) bool and, once per
+        rollout, `log`, which holds means over the rollout as 0-dimensional tensors.
 
         Raises:
             ValueError: the actions have another shape, or are not real numbers; the state is then unchanged.
@@ -376,7 +376,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Return the mirror images of observations and actions; None if the task has no mirror image.
 
         Raises:
-            ConfigError: a term has another number of columns than its kind.
+            ConfigError: the number of a term's columns does not fit its kind in `MIRRORED`.
         """
         return None
 

@@ -25,11 +25,12 @@ MOST_IN_A_POOL = 2**31 - 1
 MOST_SAMPLES = 2**28
 """Largest number of samples in an iteration."""
 MOST_WEIGHTS = 2**30
-"""Largest number of weights in a layered network. With gradients and the optimiser's moments they take 16 GB."""
+"""Largest number of weights between the hidden layers of a network. With gradients and the optimiser's moments they take 16
+GB."""
 
 
 def check_task(cls: type, cfg: TaskConfig) -> None:
-    """Check the configuration of a task of class `cls`, for all that does not depend on a robot.
+    """Check the parts of a configuration that do not depend on a robot, for a task of class `cls`.
 
     Raises:
         ConfigError: a setting does not fit the class or another setting.
@@ -45,7 +46,7 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
     for name in cfg.terminations.failures:
         if name in cfg.terminations.time_outs:
             where = cfg.origins.where("terminations.time_outs")
-            raise ConfigError(f"{where}: '{name}' is a failure already (terminations.failures); it can be only one of both")
+            raise ConfigError(f"{where}: '{name}' is also in terminations.failures; remove it from one of the two")
     for name in cls.QUANTITIES:  # type: ignore[attr-defined]
         if name not in (*STAGES, *LAST_STEP):
             known = suggest(name, (*STAGES, *LAST_STEP), "quantities")
@@ -58,8 +59,8 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
 
 
 def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
-    """Return the names of the figures of evaluations during training, for a task of class `cls`: the standard ones, then the
-    task's own metrics. The first one chooses the best policy, unless train.runner.best_by names another one.
+    """Return the names of the figures of evaluations during training, for a task of class `cls`: first the standard figures,
+    then the task's metrics. The first figure chooses the best policy, unless train.runner.best_by names another.
     """
     first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
     return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]
@@ -87,7 +88,7 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
             raise ConfigError(f"{where}: evaluations of '{cfg.task}' find no {name!r}{suggest(name, figures, 'they find')}")
     if runner.stop_at and not runner.evaluate_interval:
         where = cfg.origins.where("train.runner.stop_at")
-        raise ConfigError(f"{where}: nothing is evaluated during training; train.runner.evaluate_interval=50 does it")
+        raise ConfigError(f"{where}: needs evaluations during training; set train.runner.evaluate_interval, such as 50")
     if runner.evaluate_interval and runner.evaluate_s and round(runner.evaluate_s / cfg.dt) < 1:
         where, given = cfg.origins.where("train.runner.evaluate_s"), runner.evaluate_s
         raise ConfigError(
@@ -147,8 +148,8 @@ def check_sizes(cfg: TaskConfig) -> None:
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Check that every observation in `used` has a valid kind in `mirrored`, the table MIRRORED of the class `task`. `where`
-    is the beginning of error messages.
+    """Check that every observation in `used` has a valid kind in `mirrored`, which is the table MIRRORED of the class `task`.
+    Error messages begin with `where`.
 
     Raises:
         ConfigError: an observation has no kind, or an unknown one.

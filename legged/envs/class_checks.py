@@ -131,7 +131,7 @@ def check_overrides(cls: type) -> None:
 
 
 def _names_in(code: CodeType) -> set[str]:
-    """Return the attributes and globals that a function, or a function within it, names."""
+    """Return the names of the attributes and globals that a function or its nested functions use."""
     within = [constant for constant in code.co_consts if isinstance(constant, CodeType)]
     return set(code.co_names).union(*(_names_in(constant) for constant in within))
 
@@ -140,7 +140,7 @@ def _check_constructor(part: type) -> None:
     """Check that the constructor of a class takes the arguments that the registry passes.
 
     Raises:
-        ConfigError: it does not.
+        ConfigError: the constructor takes other arguments.
     """
     constructor = vars(part)["__init__"]
     try:
@@ -159,7 +159,9 @@ KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "terminati
 
 
 def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
-    """Return the terms that a configuration names, each with the prefix of its method and the dotted path of its name."""
+    """Return the terms that a configuration names: for each the prefix of its method, its name, and the dotted path of the
+    setting that names it.
+    """
     named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
     for group, content in groups_in(cfg).items():
         named += [("_obs_", name, path_of_terms(cfg, group)) for name in content.terms]
@@ -193,13 +195,14 @@ def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
     """Check the method `name` of a term that the setting at `path` names.
 
     Raises:
-        ConfigError: it is not a method, or takes arguments.
+        ConfigError: the term is not a method, or takes arguments.
     """
     found = inspect.getattr_static(cls, name)
     where = f"{origins.where(path)}: {cls.__name__}.{name}"
     if isinstance(found, property) or not callable(getattr(cls, name)):
         raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
-    # Python passes `self` to a plain method, and nothing to a static method; the class of a classmethod is bound already.
+    # In `parameters`, only a plain method still has its first argument: a static method has none, and a classmethod's is
+    # bound.
     bound = isinstance(found, classmethod | staticmethod)
     parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
     needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
@@ -212,7 +215,7 @@ def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
 
 
 def place(cls: type, attribute: Any) -> str:
-    """Return file and line of an attribute of a class; only the file, or the module, if Python knows no more."""
+    """Return file and line of a class's attribute. If Python does not know the line, return the file or the module."""
     function = inspect.unwrap(getattr(attribute, "fget", None) or getattr(attribute, "__func__", attribute))
     code = getattr(function, "__code__", None)
     if code is not None:

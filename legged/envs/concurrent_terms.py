@@ -1,4 +1,4 @@
-"""Evaluation of terms with the mark `@concurrent` on parallel CUDA streams, before terminations are settled."""
+"""Evaluation of terms with the mark `@concurrent` on parallel CUDA streams, while terminations are determined."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,13 +14,13 @@ Function = Callable[[], Tensor]
 class ConcurrentTerms:
     """Terms that run at the same time as `check_termination`, on several streams. On the CPU they run one after the other.
 
-    A term is a few launches, which on a GPU mostly wait for each other. One after the other, the rewards of a quadruped take
-    a tenth of a step; on parallel streams they take next to no time.
+    On a GPU, a term is a few short launches, and most of their time is waiting for each other. One after the other, the
+    rewards of a quadruped take a tenth of a step. On parallel streams they take almost no time.
     """
 
     def __init__(self, device: torch.device, streams: int, settled: Callable[[], Mapping[str, Tensor]]) -> None:
         """Create the `streams` that terms are distributed over. With 0 streams every term runs when it is called. `settled`
-        returns by name the tensors that are written at the same time; terms here must not read them.
+        returns, by name, the tensors that other code writes at the same time. Terms on the streams must not read them.
         """
         self._branches = [Branch(device) for _ in range(streams)]
         self._functions: list[dict[str, Function]] = [{} for _ in range(streams)]
@@ -62,7 +62,7 @@ class ConcurrentTerms:
         """Return the value of a term, and check that it reads no tensor of `settled`."""
         forbidden = ForbidReads(
             self._settled(),
-            "which is not settled yet for a term with @concurrent: remove that mark, so that the term runs after"
+            "which is written after the terms with @concurrent: remove that mark, so that the term runs after"
             " check_termination",
         )
         with forbidden:

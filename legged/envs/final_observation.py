@@ -1,4 +1,4 @@
-"""Final observations of episodes: watchers copy the end of each step before episodes are reset."""
+"""Final observations of episodes. Watchers copy tensors at the end of each step, before episodes are reset."""
 
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -17,7 +17,9 @@ class StepWatcher(Protocol):
     """
 
     def take(self) -> None:
-        """Copy tensors of the task. Runs within the captured step, so without reads by the host or new addresses."""
+        """Copy tensors of the task. This runs within the captured step, so the host must not read, and addresses must not
+        change.
+        """
 
 
 Watcher = TypeVar("Watcher", bound=StepWatcher)
@@ -37,7 +39,7 @@ class FinalStep:
         """(N, nq) and (N, nv) generalised positions and velocities."""
 
     def take(self) -> None:
-        """Copy observations and state now, in the middle of a step. The terms are evaluated once more for it."""
+        """Copy observations and state in the middle of a step. For this the terms are evaluated once more."""
         self._terms.evaluate()
         for name, group in self._groups.items():
             group.preview(self.observations[name])
@@ -46,13 +48,13 @@ class FinalStep:
 
 
 def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
-    """Attach a `FinalStep` to a task and return it, by `watch_steps`, which describes the arguments and errors."""
+    """Attach a `FinalStep` to a task and return it. `watch_steps` describes the arguments and errors."""
     return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
 
 
 def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
-    """Attach `watcher` to a task and return it. It is called in every step from now on. All episodes and curricula are reset.
-    With `graph` the step is captured on a GPU (again, if the task was built with a graph), or checked on the CPU.
+    """Attach `watcher` to a task and return it. From now on every step calls it. All episodes and curricula are reset. With
+    `graph` the step is captured anew on a GPU, or checked on the CPU.
 
     Raises:
         TermError: the step cannot be captured.

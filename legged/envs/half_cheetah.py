@@ -46,7 +46,7 @@ class HalfCheetah(BaseTask):
 
     @unit("m, rad")
     def _obs_position(self) -> Tensor:
-        """Generalised positions but x: z, pitch, and six joint angles, of the back leg first [m, rad]."""
+        """Generalised positions without x: z, pitch, and six joint angles, of the back leg first [m, rad]."""
         return self.physics.qpos[:, 1:]
 
     @unit("m/s, rad/s")

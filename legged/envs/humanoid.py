@@ -1,4 +1,4 @@
-"""Humanoid: a humanoid runs as fast as it can, with the observations and rewards of the tutorial of MuJoCo XLA.
+"""Humanoid: a humanoid runs as fast as it can. Observations and rewards are those of MuJoCo XLA's tutorial.
 
 The task goes back to Tassa, Erez and Todorov, "Synthesis and stabilization of complex behaviors through online trajectory
 optimization", 2012. The model is Gymnasium's humanoid.xml.
@@ -26,7 +26,7 @@ class HumanoidConfig(TaskConfig):
     """Configuration of the humanoid's task: the sections of every task, and two settings."""
 
     healthy_z: Range = field(default=(1.0, 1.5), metadata=quantity("m", between(0, 10)))
-    """Lowest and highest torso height at which the humanoid counts as on its feet [m]."""
+    """Lowest and highest torso height at which the humanoid counts as standing [m]."""
     reset_noise: float = field(default=0.01, metadata=quantity("m, rad, m/s, rad/s", between(0, 1)))
     """Half width of the uniform noise on the positions and velocities of initial states [m, rad, m/s, rad/s]."""
 
@@ -65,14 +65,14 @@ class Humanoid(BaseTask):
         self.last_com.copy_(self.com)
 
     def healthy(self) -> Tensor:
-        """Return a mask (N,) of the humanoids that are on their feet."""
+        """Return a mask (N,) of the humanoids that stand."""
         low, high = self.cfg.healthy_z
         height = self.physics.qpos[:, 2]
         return (height >= low) & (height <= high)
 
     @unit("m, 1, rad")
     def _obs_position(self) -> Tensor:
-        """Generalised positions but x and y: z and orientation (w, x, y, z) of the torso, then the joints [m, 1, rad]."""
+        """Generalised positions without x and y: z and orientation (w, x, y, z) of the torso, then the joints [m, 1, rad]."""
         return self.physics.qpos[:, 2:]
 
     @unit("m/s, rad/s")
@@ -92,7 +92,7 @@ class Humanoid(BaseTask):
 
     @unit("N, N m")
     def _obs_actuator_force(self) -> Tensor:
-        """MuJoCo's qfrc_actuator: what motors do to each degree of freedom, at the last physics step [N, N m]."""
+        """MuJoCo's qfrc_actuator: force of the motors on each degree of freedom, at the last physics step [N, N m]."""
         return self.qfrc_actuator
 
     @concurrent

@@ -54,7 +54,7 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     if robot.mirror is None:
         raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
-    if uneven is not None:  # `dof_pos` and actions are relative to the default pose
+    if uneven is not None:  # `dof_pos` and actions are relative to that pose
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
         raise ConfigError(
@@ -83,13 +83,13 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
-    """Check that a randomised property which is observed has a mirror image.
+    """Check that an observed, randomised property has a mirror image.
 
-    Numbers for each body, shape or passive joint have none, because those are not paired left and right. One offset for all
-    joints has none either, because mirrored joints have offsets of either sign.
+    A property with a number for each body, shape or passive joint has none, because these are not paired left and right. One
+    offset for all joints has none either, because mirroring changes the sign of some joints' offsets.
 
     Raises:
-        ConfigError: it has no mirror image.
+        ConfigError: the property has no mirror image.
     """
     draw, kind = observed(cfg, name), MIRROR_KINDS[f"{PREFIX}{name}"]
     if draw is None:
@@ -125,7 +125,7 @@ def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
     """Check that the lightest base that can be drawn has a positive mass.
 
     Raises:
-        ConfigError: its mass is zero or negative.
+        ConfigError: the mass is zero or negative.
     """
     lowest = cfg.domain_rand.added_mass_range[0]
     if cfg.domain_rand.randomize_base_mass and robot.base_mass + lowest <= 0.0:
@@ -137,10 +137,10 @@ def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
 
 
 def check_points(cfg: LeggedConfig) -> None:
-    """Check that the height scan has at most MOST_POINTS points, so that it fits memory.
+    """Check that the height scan has at most MOST_POINTS points, so that it fits in memory.
 
     Raises:
-        ConfigError: it has more points.
+        ConfigError: the scan has more points.
     """
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:

@@ -1,7 +1,7 @@
-"""Attributes of legged_gym's environment classes and of its forks, for tasks here: other names of tensors, values computed on
-reading, and hints for attributes that do not exist.
+"""Attributes of the environment classes of legged_gym and its forks, for tasks of this package: other names of tensors,
+values computed when they are read, and hints for attributes that do not exist.
 
-They cost nothing until they are read. An attribute that a class sets itself has precedence.
+These attributes cost nothing until they are read. An attribute that a class sets itself has precedence.
 """
 
 import difflib
@@ -20,8 +20,8 @@ IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordi
 
 
 class ReadOnly(Tensor):
-    """Tensor that is computed on reading, so that writing into it or into a view of it would have no effect. An attempt to
-    write raises an AttributeError with an alternative. Results computed from it are ordinary tensors.
+    """Tensor that is computed when it is read, so that writing into it or into a view of it would have no effect. An attempt
+    to write raises an AttributeError with an alternative. Results computed from it are ordinary tensors.
     """
 
     instead: str = ""
@@ -63,7 +63,7 @@ def _root_states(task: Any) -> Tensor:
 
 
 def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return `get`, made to raise an AttributeError if the task has no terrain."""
+    """Wrap `get` so that it raises an AttributeError if the task has no terrain."""
 
     def read(task: Any) -> Any:
         if task.terrain_curriculum is None:
@@ -95,7 +95,7 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 def _noise_scale_vec(task: Any) -> Tensor:
     errors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
-    measured = errors.noise if errors is not None and noisy else {}  # noise that is added with the other errors
+    measured = errors.noise if errors is not None and noisy else {}  # this noise is added with the other errors
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 
@@ -251,7 +251,7 @@ class LeggedGymNames:
     `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
     continue or end at this step [s]. `rpy` (N, 3) has roll, pitch and yaw [rad]. `friction_coeffs` is (N, 1, 1),
     `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3); `noise_scale_vec` has a number for
-    each of the actor's columns. The other names are like their counterparts here.
+    each of the actor's columns. All other names have the shapes and units of their counterparts in this package.
     """
 
     reset_buf: Tensor
@@ -259,7 +259,7 @@ class LeggedGymNames:
     if not TYPE_CHECKING:  # so that a type checker still reports missing attributes
 
         def __getattr__(self, name: str) -> Any:
-            if hasattr(type(self), name):  # a property that failed: evaluating it again raises its own error
+            if hasattr(type(self), name):  # this property failed; reading it again raises its error
                 return object.__getattribute__(self, name)
             if name in NAMES:
                 try:
@@ -275,7 +275,7 @@ class LeggedGymNames:
         """Return the value of one of legged_gym's names.
 
         Raises:
-            AttributeError: this task does not have it; the text has a hint at the replacement.
+            AttributeError: this task lacks it; the text suggests a replacement.
         """
         if name in PLAIN:
             return PLAIN[name](self)
@@ -303,6 +303,6 @@ class LeggedGymNames:
         """Store the values of `KEPT` that were read, before the task overwrites its own stored values."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
-            if name == "last_last_actions":  # `last_actions` is here still that of the ended episode
+            if name == "last_last_actions":  # for ended episodes `last_actions` is out of date
                 masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]

@@ -31,7 +31,7 @@ from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
 POSES = 256
-"""Number of poses with closed loops that are drawn at the start."""
+"""Number of poses that are drawn at the start for a robot with closed loops."""
 
 
 class LeggedRobot(Terms, LeggedGymNames, BaseTask):
@@ -46,11 +46,11 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def __init__(
         self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
-        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. A given `terrain` replaces that of
-        the configuration.
+        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. If `terrain` is given, it replaces
+        the configured one.
 
         Raises:
-            ConfigError: the configuration names something that does not exist; nothing is compiled then.
+            ConfigError: the configuration names something that does not exist. Nothing has been compiled yet.
             TermError: a term fails or cannot be captured.
         """
         self.terrain = terrain
@@ -169,7 +169,9 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return torch.where(torch.isfinite(bounded), bounded, limits)
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
-        """Return the terminations that are evaluated: without limits that are 0, and without `left_terrain` on a plane."""
+        """Return the terminations that are evaluated. A limit of 0 switches its termination off. On a plane `left_terrain` is
+        off.
+        """
         cfg = self.cfg.terminations
         limits = (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt))
         ours = {
@@ -182,9 +184,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return [name for name in failures if name not in off], [name for name in time_outs if name not in off]
 
     def observation_scales(self) -> dict[str, Any]:
-        """Return the factor on each term. Without a setting, commands have the factors of the velocities that they
-        command.
-        """
+        """Return the factor on each term. By default, commands have the factors of the velocities that they command."""
         scales = super().observation_scales()
         lin, ang = scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
         scales.setdefault("commands", [lin, lin, ang])
@@ -220,8 +220,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.disturbances.draw()
 
     def draw_reset(self) -> None:
-        """Draw initial states: joints near the default pose, and a moving base at its spawn height. For a robot with passive
-        joints, choose one of the poses that were drawn at the start, because loops must close.
+        """Draw initial states: joints near the default pose, and a moving base at its spawn height. A robot with passive
+        joints gets one of the poses that were drawn at the start, because its loops must be closed.
         """
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.draw()
@@ -255,7 +255,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def reset_idx(self, mask: Tensor) -> None:
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
-        self.control.reset(mask)  # last: the past of actuators is filled with default angles, which `redraw` may have changed
+        self.control.reset(mask)  # last, because it reads default angles, which `redraw` may change
 
     def forget(self, mask: Tensor) -> None:
         super().forget(mask)
@@ -271,7 +271,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._vary_velocity_limits(again=True)
 
     def _vary_control(self, again: bool = False) -> None:
-        """Apply randomised properties to the control law: all of them, or with `again` those that change within steps."""
+        """Apply randomised properties to the control law. With `again`, apply only those that change within steps."""
         names = self.randomization.redrawn if again else self.randomization.draws
         drawn = self.randomization.fields
         self.control.vary({name: drawn[name] for name in names})

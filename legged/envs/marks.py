@@ -1,4 +1,4 @@
-"""Marks on the methods of a task: the unit of a term, and that a term may run before terminations are settled.
+"""Marks on the methods of a task. One gives the unit of a term; the other lets a term run before terminations are determined.
 
 A mark belongs to one method. A method that overrides it in another class has only the marks that are written above itself.
 """
@@ -41,9 +41,9 @@ def concurrent(method: Method) -> Method:
     """Let a reward, a termination or a metric run on a parallel stream while `check_termination` determines which episodes
     end.
 
-    Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not settled yet.
-    If it does, the first step raises a TermError. It must not write a tensor that another term reads either. Terms without
-    the mark run after `check_termination`, in the order of the configuration.
+    Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not written yet.
+    If it does, the first step raises a TermError. Nor may it write a tensor that another term reads. Terms without the mark
+    run after `check_termination`, in the order of the configuration.
 
     BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too: they write no tensor that a term
     with the mark reads. If a class overrides one of them without the mark, all terms run as if they had no mark.

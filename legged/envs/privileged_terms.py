@@ -22,8 +22,8 @@ class PrivilegedTerms:
     """Mixin of BaseTask with the terms `_obs_rand_<field>`, one for each field of `physics.FIELDS`, and `_obs_push_force`.
 
     A field's term is (N, 1), or (N, rows) if every row has its own number. Its values -1 and 1 are the ends of the configured
-    range, even if the range has not fully grown; with `log_uniform` the scale is logarithmic. A field that only
-    `domain_rand.observed_ranges` names has its neutral value.
+    range, even while the range is still widening. With `log_uniform` the scale is logarithmic. A field that only
+    `domain_rand.observed_ranges` names always has its neutral value.
     """
 
     cfg: Any
@@ -47,7 +47,7 @@ class PrivilegedTerms:
 
 
 def _mirror_kind(name: str, field: Field) -> MirrorKind:
-    """Return the kind of a field's mirror image. A field with a number for each body or shape has none."""
+    """Return the kind of a field's mirror image."""
     if name == "joint_offset":
         return "joints"
     if name.endswith("_y"):
@@ -66,12 +66,14 @@ def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
 
 
 def largest_of(force: ForceConfig) -> float:
-    """Return the largest component of a force that can be drawn [N]. An observed force is a share of it."""
+    """Return the largest component of a force that can be drawn [N]. Observations give forces as a share of it."""
     return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
 
 
 def observed(cfg: Any, name: str) -> DrawConfig | None:
-    """Return the draw by whose range a field is normalised in observations; None if the configuration has no range for it."""
+    """Return the draw whose range normalises a field in observations. Return None if the configuration has no range for the
+    field.
+    """
     rand = cfg.domain_rand
     entry = rand.observed_ranges.get(name, rand.ranges.get(name))
     if entry is None and name == "friction" and getattr(rand, "randomize_friction", False):

@@ -87,10 +87,10 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
 
 
 def _check_grow(of: DrawConfig | KickConfig | ForceConfig, path: str, where: Callable[[str], str]) -> None:
-    """Check the iterations between which a range grows.
+    """Check the iterations between which a range widens.
 
     Raises:
-        ConfigError: the first equals the last, and they are not both 0.
+        ConfigError: the first equals the last, and both are not 0.
     """
     if of.grow != (0.0, 0.0) and of.grow[0] == of.grow[1]:
         told = "expected [first, last] with first < last, or [0, 0] for no growth"
@@ -126,7 +126,7 @@ def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
     """Check kicks and forces.
 
     Raises:
-        ConfigError: one has no effect, an invalid growth, or a body that the robot does not have.
+        ConfigError: a kick or force has no effect, has an invalid `grow`, or names a body that the robot does not have.
     """
     where = cfg.origins.where
     for name, kick in cfg.domain_rand.kicks.items():
@@ -164,7 +164,7 @@ def check_observed(cfg: TaskConfig) -> None:
             draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
             if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
                 low, high = draw.range
-                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # a mirrored value would lie beyond -1 or 1
+                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # mirrored, a value would leave [-1, 1]
                     raise ConfigError(
                         f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not the same on both sides of"
                         " 0, so it has no mirror image; train.algorithm.symmetry=false learns without"

@@ -33,15 +33,15 @@ class RandomizedTask:
         return Randomization(self.cfg.domain_rand.ranges, self.num_envs, self.device)
 
     def pushed_by_forces(self) -> bool:
-        """Return whether external forces act on bodies (`physics.forces`)."""
+        """Return True if external forces act on bodies (`physics.forces`)."""
         return False
 
     def _build_physics(self, scene: Scene) -> None:
         """Build the physics of a scene, and apply the randomised properties.
 
         Raises:
-            ConfigError: the engine or the model does not have a randomised property, or `each` is set for a property of which
-                a robot has only one number.
+            ConfigError: the engine or the model lacks a randomised property, or `each` is set for a property of which a robot
+                has only one.
         """
         cfg, where = self.cfg, self.cfg.origins.where
         fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
@@ -53,7 +53,7 @@ class RandomizedTask:
         for name, draw in self.randomization.draws.items():
             if draw.each and self.field_rows[name] < 2:
                 path = where(f"domain_rand.ranges.{name}.each")
-                raise ConfigError(f"{path}: there is only one number of it for each robot; leave each out")
+                raise ConfigError(f"{path}: each robot has only one number of this property; leave each out")
         self.randomization.widen(self.field_rows)
         self.randomization.apply(self.physics)
 
@@ -75,8 +75,8 @@ class RandomizedTask:
 
     def redraw(self, mask: Tensor) -> None:
         """Hook: apply new values of randomised properties to the environments of `mask` (N,), whose episodes begin, and to
-        those whose interval has elapsed. Called only if some property changes within steps. Runs at the same time as
-        `forget`.
+        those whose interval has elapsed. The hook is called only if a property changes within steps, and runs at the same
+        time as `forget`.
         """
         self.randomization.redraw(mask)
         with self._stream_2.fork():

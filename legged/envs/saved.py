@@ -1,5 +1,5 @@
-"""State of a task for checkpoints. Every checkpoint holds the progress of curricula; the newest also has the full state of
-the simulation, in a separate file.
+"""State of a task for checkpoints. Every checkpoint holds the progress of curricula. For the newest checkpoint, a separate
+file holds the full state of the simulation.
 """
 
 from typing import Any
@@ -64,12 +64,12 @@ class SavedTask(RandomizedTask):
                 load_state(part, state.get(name, {}))
             take(self._own_tensors(), state.get("task", {}), type(self).__name__)
         finally:
-            self.apply_randomization()  # the engine must have the same properties as `randomization`, even after an error
+            self.apply_randomization()  # engine and `randomization` must agree even after an error
         self.physics.load_state(state.get("physics", {}))
 
     def _own_tensors(self) -> dict[str, Tensor]:
-        """Return the tensors with a row per environment that are attributes of the task, including those of subclasses.
-        Tensors that belong to a part or to the physics are left out.
+        """Return the attributes of the task, and of its subclasses, that are tensors with a row per environment. Tensors that
+        belong to a part or to the physics are left out.
         """
         owners = [self.physics, self.physics.robot_state, *self.parts().values()]
         others = [*self.physics.state_tensors().values()]

@@ -93,7 +93,7 @@ class Terms:
     `termination_indices` select shapes."""
     feet_indices: Tensor
     _feet_shapes: slice | Tensor
-    """Feet among the shapes. It is a slice if the indices are evenly spaced, since a slice costs no launch; so is
+    """Feet among the shapes. Evenly spaced indices become a slice, because a slice costs no launch. The same holds for
     `_terminating_shapes`."""
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
@@ -104,8 +104,7 @@ class Terms:
     control: Control
     height_scan: HeightScan
     """Ground heights in the world frame [m]: `measured_heights` (N, P) around each robot, `height_scan.ground` (N,) under
-    it.
-    """
+    each robot."""
     measured_heights: Tensor
     terminated_buf: Tensor
     """(N,) True if the episode ends now in a failure."""
@@ -281,7 +280,8 @@ class Terms:
     def _reward_feet_air_time(self) -> Tensor:
         """Long swings: air time minus its target, paid at touch-down while any motion is commanded [s].
 
-        legged_gym pays only under a horizontal command. Turning on the spot is then never paid, and not learned.
+        legged_gym rewards swings only under a horizontal command. Steps for turning on the spot are then never rewarded, and
+        not learned.
         """
         swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
         return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
@@ -312,9 +312,9 @@ class Terms:
         """Steps of a biped: half of air_time_target_s plus the other foot's air time, while exactly one foot stands and any
         motion is commanded [s].
 
-        Beyond the target the air time counts less the longer it is; from twice the target on, the reward is 0. If any long
-        swing were paid, robots would take one step a second, and could not turn in between. If only the swing were paid,
-        short steps would be worth next to nothing, and robots that began to hop on both feet would go on hopping.
+        Beyond the target, a longer air time earns less, and from twice the target on the reward is 0. If every long swing
+        were rewarded, robots would take one step a second and could not turn in between. If the fixed half were missing,
+        short steps would earn almost nothing, and robots that began to hop on both feet would go on hopping.
         """
         alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
         target = self.cfg.rewards.air_time_target_s

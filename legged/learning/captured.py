@@ -1,4 +1,6 @@
-"""Training loop that makes two calls an iteration, a rollout and an update. On a GPU each call replays one CUDA graph."""
+"""Training loop that makes two calls per iteration: one for the rollout, one for the update. On a GPU each call replays one
+CUDA graph.
+"""
 
 import math
 import time
@@ -31,14 +33,15 @@ from legged.process.startup import stage_ended
 ROLLOUTS_TO_WARM_UP = 1
 """Number of warm-up rollouts before capture. One is enough, because the task warmed up its step when it was built."""
 LOGGED = "log/"
-"""Prefix of the names of the task's log entries in a readback."""
+"""Prefix of the task's log entries in an AsyncReadback."""
 
 
 class CapturedRunner(Runner):
-    """Runner whose loop keeps the host out of the way: it launches work, and reads the logged numbers once per iteration.
+    """Runner whose loop only launches work on the device, and reads the logged numbers once per iteration.
 
     On a GPU it launches the next iteration before it logs the last one, so the device never waits for the log. Checkpoints,
-    configuration and logs are those of Runner. Where a feature needs rsl-rl's own loop (`why_stock`), `learn` is Runner's.
+    configuration and logs are those of Runner. If a feature needs rsl-rl's own loop, `why_stock` names the feature and
+    `learn` runs that loop.
     """
 
     alg: DevicePPO
@@ -94,7 +97,7 @@ class CapturedRunner(Runner):
             unlogged = launched
             saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
             evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
-            # The second-last iteration is logged at once, so that a request to stop takes effect before the last one.
+            # The second-last iteration is logged at once, so that a request to stop takes effect before the last one starts.
             if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
                 self._log(launched)
                 unlogged = None
@@ -103,15 +106,15 @@ class CapturedRunner(Runner):
             if saves:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
             if saves or evaluates:
-                clock = None  # the time of an iteration excludes saving and evaluation
+                clock = None  # a new clock, so that saving and evaluation don't count
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
     @property
     def _runs_ahead(self) -> bool:
-        """True if the next iteration is launched before the last one is logged. Several processes do not run ahead, because
-        all of them must agree to stop.
+        """True if the next iteration is launched before the last one is logged. With several processes it is False, because
+        all of them must agree before training stops.
         """
         return torch.device(self.device).type == "cuda" and not self.is_distributed
 
@@ -122,8 +125,8 @@ class CapturedRunner(Runner):
     def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
         """Return three functions: the rollout, the update, and the update of the value function alone.
 
-        They are CUDA graphs where the task's step is one. The third function differs from the second only if training begins
-        with updates of the value function (`warms_up`). Networks and task are afterwards as they were before.
+        They replay CUDA graphs if the task's step does. The third function differs from the second only if training begins
+        with updates of the value function (`warms_up`). Afterwards networks and task are in the state that they had before.
         """
         device = torch.device(self.device)
         enabled = self.env.captured
@@ -142,7 +145,7 @@ class CapturedRunner(Runner):
             known = {id(tensor) for tensor, _ in before}
             for state in self.alg.optimizer.state.values():
                 for tensor in state.values():
-                    if id(tensor) not in known:  # created in the trial steps
+                    if id(tensor) not in known:  # the trial steps created this tensor
                         tensor.zero_()
         if enabled:
             rollout.forget()
@@ -161,8 +164,8 @@ class CapturedRunner(Runner):
         return AsyncReadback({"ended": rollout.ended, **self.alg.outcome(), **named})
 
     def _log_before(self, launched: "LaunchedIteration", following: "LaunchedIteration") -> None:
-        """Log an iteration while the device computes the `following` one. If training ends here, log that one too, because
-        the networks have learned from it.
+        """Log an iteration while the device computes the `following` one. If training ends here, log the `following` one too,
+        because the networks have learned from it.
 
         Raises:
             Interrupted: the training was asked to stop.
@@ -210,17 +213,17 @@ class CapturedRunner(Runner):
 def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
     """Copy tensors outside autograd.
 
-    A copy that autograd knows would keep the node that accumulates the parameter's gradient, and with it the stream of the
-    copy. A capture on another stream may not wait for that stream.
+    If autograd recorded a copy, the node that accumulates the parameter's gradient would stay bound to the stream of the
+    copy. A later capture on another stream would have to wait for that stream, and CUDA forbids this.
     """
     return [tensor.clone() for tensor in tensors]
 
 
 class Clock:
-    """Stopwatch for consecutive laps. On a GPU, events on the device measure the times without making anything wait."""
+    """Stopwatch for consecutive laps. On a GPU, CUDA events measure the times, so that the host need not wait."""
 
     def __init__(self, device: torch.device, before: "Clock | None" = None) -> None:
-        """Start now, or where the clock `before` ended, so that the work between the two is included."""
+        """Start now, or at the end of the clock `before`, so that the first lap includes the work between the two clocks."""
         self._cuda = device.type == "cuda"
         self._marks: list[Any] = [] if before is None else before._marks[-1:]
         if before is None:

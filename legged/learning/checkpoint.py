@@ -29,7 +29,7 @@ Saved = dict[str, Any]
 
 def write_checkpoint(path: Path, saved: Saved) -> None:
     """Write a checkpoint atomically."""
-    buffer = io.BytesIO()  # on a full disk, torch.save fails with a message that hides the cause
+    buffer = io.BytesIO()  # if the disk is full, torch.save to a file hides the cause
     torch.save(saved, buffer)
     write_bytes(path, buffer.getbuffer())
 
@@ -117,7 +117,9 @@ INFOS: dict[str, Kind] = {
 
 
 def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
-    """Raise ConfigError if an entry of `found` has the wrong type. Missing entries pass; their users check for them."""
+    """Raise ConfigError if an entry of `found` has the wrong type. A missing entry passes; the code that reads the entry
+    checks for it.
+    """
     for key, kind in kinds.items():
         if key not in found:
             continue
@@ -154,8 +156,8 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
-    """Return an optimiser's state from a checkpoint, with checked moments. Every setting but the learning rate is that of
-    `optimizer`. The first `waiting` parameters may lack moments, but only all of them together.
+    """Return an optimiser's state from a checkpoint, with checked moments. The settings other than the learning rate are
+    those of `optimizer`. The first `waiting` parameters may all lack moments, but not only some of them.
 
     Raises:
         ConfigError: the state does not fit these parameters; the text begins with `where`.
@@ -221,16 +223,14 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     described = {}
     for name in NETWORKS:
         read = groups_of(cfg, name)
-        own = {"observations": list(read), "history": groups[read[0]].history}  # for old versions
+        own = {"observations": list(read), "history": groups[read[0]].history}  # old versions read these
         hidden = list(getattr(policy, f"{name}_hidden_dims"))
         described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that `networks` gives, for a checkpoint that lacks them, as far as the weights in `state` show
-    them.
-    """
+    """Return those settings of `networks` that the weights in `state` show, for a checkpoint that does not store them."""
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")
@@ -247,14 +247,14 @@ def network_of(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
-    """Return the settings of each network in a checkpoint, completed by what only the weights show."""
+    """Return the settings of each network in a checkpoint. Settings that are not stored are derived from the weights."""
     said: dict[str, Any] = saved["infos"].get("networks", {})
     return {name: {**network_of(saved[f"{name}_state_dict"]), **said.get(name, {})} for name in networks_in(saved)}
 
 
 def histories(saved: Saved) -> dict[str, int]:
-    """Return the number of steps in each observation group of a checkpoint, where it is known. In old files each network
-    reads the group of its own name.
+    """Return the history [steps] of each observation group of a checkpoint, where it is known. In old files each network
+    reads the group that has the network's name.
     """
     infos = saved["infos"]
     old = {name: said["history"] for name, said in infos.get("networks", {}).items() if "history" in said}
@@ -287,7 +287,7 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> None:
-    """Compare the robot of a checkpoint, its `name` and `joints`, with that of a configuration.
+    """Compare the robot that a checkpoint was made for (`name` and `joints`) with the robot of a configuration.
 
     Raises:
         ConfigError: the robot has other joints, or the same in another order.
@@ -323,7 +323,7 @@ def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     """Check that the optimiser of a checkpoint is the configured one. A checkpoint that names no optimiser used Adam.
 
     Raises:
-        ConfigError: it is another one.
+        ConfigError: the two optimisers differ.
     """
     found, wanted = saved["infos"].get("optimizer", "adam"), cfg.train.algorithm.optimizer
     if found != wanted:

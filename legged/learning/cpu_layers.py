@@ -13,10 +13,10 @@ PARTS = 8
 
 
 class ExponentialUnit(torch.autograd.Function):
-    """ELU with alpha 1 (Clevert et al., arXiv 1511.07289): x where it is positive, else exp(x) - 1.
+    """ELU with alpha 1 (Clevert et al., arXiv 1511.07289): x if x is positive, else exp(x) - 1.
 
-    On a CPU torch's ELU takes twice as long, a quarter of an update. This one uses exp2, by far the fastest of torch's
-    exponentials. It needs no branch, because ELU is the larger of x and min(exp(x), 1) - 1.
+    On a CPU torch's ELU takes twice as long, which is a quarter of an update's time. This one uses exp2, by far the fastest
+    of torch's exponentials. It needs no branch, because ELU is the larger of x and min(exp(x), 1) - 1.
     """
 
     @staticmethod
@@ -37,8 +37,8 @@ class ExponentialUnit(torch.autograd.Function):
 class Affine(torch.autograd.Function):
     """Linear layer for a batch x (N, I), with gradients that are bit-identical for any number of threads.
 
-    The gradient of the weights is a sum over N. torch's library splits that sum over all its threads. The result would then
-    depend on the number of threads, which follows from the load of the machine.
+    The gradient of the weights is a sum over N. torch's library splits that sum among its threads, so the rounding depends on
+    their number, and that number on the load of the machine. This layer always splits the sum into `PARTS` parts.
     """
 
     @staticmethod

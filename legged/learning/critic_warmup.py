@@ -33,7 +33,7 @@ class CriticWarmup(ScaledRewards):
         """Freeze the policy during rsl-rl's update in the block, so that the update changes the value function alone."""
         actor, schedule = self._raw_actor, self.schedule
         learned = [parameter for parameter in actor.parameters() if parameter.requires_grad]
-        normalized, actor.obs_normalization = actor.obs_normalization, False  # False: keep the normaliser
+        normalized, actor.obs_normalization = actor.obs_normalization, False  # so the update keeps the normaliser
         self.schedule = "fixed"  # the divergence is 0 up to rounding, so the adaptive rate would rise at every mini-batch
         for parameter in learned:
             parameter.requires_grad_(False)

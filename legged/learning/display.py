@@ -19,12 +19,12 @@ PLAIN_LINES_EVERY_S = 2.0
 
 @dataclass(frozen=True)
 class Style:
-    """Format of a metric that differs from the default, its name and two decimals."""
+    """Format of a metric. A metric without a Style is shown with its name and two decimals."""
 
     row: str
     """Label in the table."""
     word: str
-    """Label on the line; empty if the metric continues the previous metric."""
+    """Label on the plain line; empty if the value shares the previous metric's label."""
     spec: str
     unit: str
     factor: float = 1.0
@@ -40,7 +40,7 @@ STYLES = {
 }
 """Metrics that come first, in this order, if the task logs them."""
 ON_THE_LINE = len(STYLES)
-"""Number of metrics on the line. A task that lacks some of `STYLES` shows others in their place."""
+"""Number of metrics on a plain line. A task that lacks some of `STYLES` shows others in their place."""
 WARNINGS = {
     "non_finite_worlds": "{:.0f} robots reset for NaN or infinite numbers (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",

@@ -18,7 +18,7 @@ from legged.learning.recurrent import Memory
 
 
 class DeviceDistillation(Distillation):
-    """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for recurrent and other students.
+    """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for students with and without recurrent layers.
 
     The differences from rsl-rl are these. Losses are summed on the device and read once per iteration. A student without
     recurrent layers learns from all steps of a gradient in one batch. The optimiser is fused. A recurrent teacher keeps its
@@ -60,7 +60,9 @@ class DeviceDistillation(Distillation):
 
     @property
     def fits_graph(self) -> bool:
-        """True if an update can be captured. Recurrent layers can't be, because the GPU's library chooses their launches."""
+        """True if an update can be captured. An update of recurrent layers can't be, because the GPU's library chooses which
+        kernels it launches for them.
+        """
         return not self.student.is_recurrent
 
     def tensors(self) -> list[Tensor]:
@@ -100,8 +102,8 @@ class DeviceDistillation(Distillation):
         return {"losses": self._losses, "std": self.action_std()}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`; without
-        `numbers`, the results of the last update are read from the device. The loss is NaN if no gradient was used.
+        """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`. If
+        `numbers` is None, the results of the last update are read from the device. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
@@ -112,7 +114,7 @@ class DeviceDistillation(Distillation):
         labels = self.storage.privileged_actions
         for x, wanted in zip(inputs.split(self.gradient_length), labels.split(self.gradient_length), strict=True):
             actions = output_of(self.student, x.flatten(0, 1), self.use_mixed_precision)
-            # This is the mean over the steps, times their number; rsl-rl adds up the means of single steps.
+            # rsl-rl adds up the mean losses of single steps. That sum is the mean over all steps times their number.
             self._descend(len(x) * self.loss_fn(actions, wanted.flatten(0, 1)))
 
     def _epoch_with_memory(self, inputs: Tensor) -> None:

@@ -15,21 +15,21 @@ class RankLost(Exception):
 
 
 def check_reachable(ranks: Ranks) -> None:
-    """Check that the environment names the meeting point of the processes, if there are several.
+    """Check that the environment gives the address at which the processes meet, if there are several.
 
     Raises:
-        ConfigError: it does not; another program's WORLD_SIZE may be left in the environment.
+        ConfigError: the address is missing. WORLD_SIZE may be left over from another program.
     """
     missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
     if ranks.several and missing:
         raise ConfigError(
-            f"WORLD_SIZE: the environment says that {ranks.count} processes train together, but not where they meet"
-            f" ({', '.join(missing)}); torchrun sets both, and one process needs neither"
+            f"WORLD_SIZE: the environment says that {ranks.count} processes train together, but lacks"
+            f" {' and '.join(missing)}; start with torchrun, or unset WORLD_SIZE to train with one process"
         )
 
 
 def join(ranks: Ranks, device: torch.device) -> None:
-    """Join the process group, once; with NCCL on GPUs and gloo on the CPU."""
+    """Join the process group, with NCCL on GPUs and gloo on the CPU. Do nothing if the process has already joined."""
     if dist.is_initialized():
         return
     check_reachable(ranks)
@@ -55,7 +55,9 @@ def sum_over_ranks_(tensor: Tensor) -> Tensor:
 
 
 def any_rank(asked: bool, device: torch.device) -> bool:
-    """Return True if `asked` is true in any process. All processes must call this together, and wait for each other."""
+    """Return True if `asked` is true in any process. All processes must call this function, because each waits for the
+    others.
+    """
     if not dist.is_initialized():
         return asked
     return bool(sum_over_ranks_(torch.tensor(float(asked), device=device)).item())

@@ -1,4 +1,4 @@
-"""Detector for trainings whose numbers become NaN or infinite. It warns of each term, and ends a training that does not
+"""Detector for trainings whose numbers become NaN or infinite. It warns once of each fault, and ends a training that does not
 recover.
 """
 
@@ -28,7 +28,7 @@ class DivergenceDetector:
     """
 
     def __init__(self, steps_per_iteration: int) -> None:
-        """Take the control steps per iteration of all robots of this process."""
+        """Take the number of control steps that all robots of this process make in an iteration."""
         self._steps = steps_per_iteration
         self._said: set[str] = set()
         self._in_a_row = 0

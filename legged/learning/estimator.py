@@ -1,5 +1,4 @@
-"""Policy with an estimator: a first part that estimates quantities that only the simulator knows, such as the velocity of the
-base.
+"""Policy with an estimator, a network that estimates quantities that only the simulator knows, such as the base velocity.
 
 Ji et al., arXiv 2202.05481, train policy and estimator in the same iterations on the same samples. PPO trains the policy, and
 the error of the estimates trains the estimator.
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from legged.mdp.observations import ObservationGroup
 
 TARGETS = "estimator"
-"""Name of the estimator's targets among rsl-rl's observation sets."""
+"""Name of the set of observations, in rsl-rl's sense, that holds the estimator's targets."""
 SECTION = "Estimator/"
 """Prefix of the estimates' errors in TensorBoard."""
 
@@ -94,7 +93,7 @@ class EstimatingModel(MLPModel):
 
 
 class EstimatingLayers(nn.Module):
-    """Layers of an EstimatingModel, from the normalised observations on, without gradients."""
+    """Copy of the layers of an EstimatingModel that follow the normaliser, for export."""
 
     def __init__(self, model: EstimatingModel) -> None:
         """Copy the layers of `model`."""

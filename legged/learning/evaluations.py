@@ -80,8 +80,8 @@ class Evaluations:
     def due(self, iterations: int, total: int, loop_s: float) -> bool:
         """Return True if an evaluation is due after `iterations` of `total`, which took `loop_s` [s].
 
-        That is at the end, and at every interval at which the share of evaluation time allows this evaluation and the last
-        one.
+        One is due at the end, and at every interval at which `evaluate_share` leaves time for two evaluations: this one and
+        the one at the end.
         """
         if iterations == total:
             return True
@@ -146,7 +146,7 @@ class Evaluations:
         """Copy the best policy of the resumed run into the new run's folder.
 
         Raises:
-            RunError: it can't be written.
+            RunError: the file can't be written.
         """
         if self._best_before is not None:
             write_bytes(folder / BEST_MODEL, self._best_before.read_bytes())

@@ -1,4 +1,4 @@
-"""Protection against NaN for the networks of rsl-rl's own update, which calls torch's optimiser itself."""
+"""Protection of the networks against NaN gradients in rsl-rl's own update, which calls torch's optimiser itself."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """The task and settings on a training's command line, stored in its run folder as given.json.
 
 The name of a user-defined task is not enough to find it: its module or file must be known too. A report therefore names the
-task as the command line did. If it can't load the task, it shows the settings of the command line.
+task as the command line did. If the report can't load the task, it shows the settings of the command line.
 """
 
 import json
@@ -41,11 +41,11 @@ def write_invocation(folder: Path, invocation: Invocation, before: Path | None =
     """Write the invocation into a run folder. `before` is the folder of the run that is resumed, if there is one.
 
     Raises:
-        RunError: it can't be written.
+        RunError: the file can't be written.
     """
     earlier: Mapping[str, Any] = {}
     if before is not None:
-        with suppress(ConfigError):  # a report on that run names the damage
+        with suppress(ConfigError):  # a report on that run will name the damage
             earlier = (read_invocation(before) or invocation).changes
     said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
     write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")

@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 class KLMeter:
-    """Wrapper around a policy's `get_kl_divergence` that records the results. Callers get the same results as before."""
+    """Wrapper around a policy's `get_kl_divergence` that records the results. Callers still get these results."""
 
     def __init__(self, policy: Any) -> None:
         self._means: list[Tensor] = []
@@ -22,6 +22,8 @@ class KLMeter:
 
     @torch.inference_mode()
     def flush(self) -> float | None:
-        """Return the mean over the calls since the last flush, or None without calls, as with a fixed learning rate."""
+        """Return the mean divergence of the calls since the last flush. Return None if there were none, as with a fixed
+        learning rate.
+        """
         means, self._means = self._means, []
         return float(torch.stack(means).mean()) if means else None

@@ -47,17 +47,18 @@ class QuietLogger(Logger):
         self.why_end: Callable[[], str] | None = None
         """Function that returns why the last evaluation ends the training, or an empty text; None if no process evaluates."""
         self.neighbours: Neighbours | None = None
-        """Counter of other trainings on this device, which explain slow times; None except in the first process."""
+        """Counter of other trainings on this device, because they slow this one down. Only the first process has it;
+        elsewhere None."""
         self.loop_s = 0.0
         """Time that this process has spent in iterations [s]."""
         self.return_std: float | None = None
-        """Standard deviation of the returns of the episodes that ended in the last rollout with such episodes. If the
-        training loop leaves it None, that of rsl-rl's buffer of returns is logged."""
+        """Standard deviation of the returns of the episodes that ended in the last rollout in which any ended. If it is None,
+        the standard deviation of rsl-rl's buffer of returns is logged."""
         self.kl_meter: KLMeter | None = None
         """Recorder of the KL divergence in rsl-rl's own update."""
         self.latest: dict[str, float] = {}
-        """Last value of everything that the task logs. An entry is NaN until it has a value; episode means have none before
-        an episode ends."""
+        """Last value of everything that the task logs. An entry is NaN until it has a value, such as an episode mean before
+        the first episode ends."""
 
     @property
     def steps_per_iteration(self) -> int:
@@ -85,7 +86,7 @@ class QuietLogger(Logger):
             self.writer.hand_over(Path(self.log_dir), iteration)
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:
-        """Write and show one iteration. Stop if any process was asked to, or has a reason to.
+        """Write and show one iteration. Stop the training if any process was asked to stop or has a reason to stop.
 
         Raises:
             Interrupted: a process was asked to stop.
@@ -111,13 +112,13 @@ class QuietLogger(Logger):
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}
         self._log_return_std(it)
-        device, self.device = self.device, "cpu"  # the numbers are on the host; this avoids a launch for each of them
+        device, self.device = self.device, "cpu"  # the numbers are on the host, and should stay there
         try:
             with contextlib.redirect_stdout(io.StringIO()):
                 super().log(it, start_it, total_it, collect_time, learn_time, loss_dict=losses, **kwargs)
         finally:
             self.device = device
-        self.ep_extras.clear()  # rsl-rl clears the episode infos only in the first process, which writes them
+        self.ep_extras.clear()  # rsl-rl clears them only in the first process
         self.divergence.update(values, left_out)
         self.latest = names | {name: value for name, value in self.latest.items() if not name.startswith(FAULT)} | values
         self.loop_s += collect_time + learn_time

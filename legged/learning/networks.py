@@ -83,8 +83,8 @@ def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> 
 
 
 def action_std(actor: MLPModel) -> Tensor:
-    """Return the standard deviations (D,) of a policy's actions, within their bounds and with a gradient. The policy must
-    have one that does not depend on the state.
+    """Return the standard deviations (D,) of a policy's actions, within their bounds and with a gradient. They must not
+    depend on the state.
     """
     distribution = actor.distribution
     if distribution.std_type == "scalar":
@@ -106,8 +106,7 @@ def reset_std(actor: MLPModel, cfg: TaskConfig) -> None:
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
     """Clamp a learned standard deviation to its bounds after each step of the optimiser.
 
-    rsl-rl clamps it only where it is used. Outside the bounds that clamp has no gradient, so the parameter would never come
-    back.
+    rsl-rl clamps it only where it is used. Outside the bounds the clamp has no gradient, so the parameter would never return.
     """
     distribution = actor.distribution
     if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:
@@ -128,8 +127,8 @@ def use_matmul(cfg: TaskConfig) -> None:
     """Set the precision of matrix products on a GPU, and their library on a CPU, for this process.
 
     On processors with AVX-512 that are not Intel's, torch's default library MKL takes 2.5 times as long as oneDNN. torch uses
-    oneDNN if bfloat16 is allowed. oneDNN still computes in float32, unless the processor has bfloat16 units (AMX); in that
-    case MKL stays.
+    oneDNN if bfloat16 is allowed. Even then oneDNN computes in float32 on a processor without bfloat16 units (AMX). On a
+    processor with such units MKL stays.
     """
     rounded = cfg.train.runner.matmul == "tf32"
     torch.backends.cuda.matmul.allow_tf32 = rounded
@@ -157,8 +156,8 @@ def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> 
 
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Update the running mean and variance with samples (n, width) of all processes, as rsl-rl does. Update in place, because
-    a graph needs fixed addresses.
+    """Update the running mean and variance with samples (n, width) of all processes, as rsl-rl does. The tensors are updated
+    in place, because a graph needs fixed addresses.
     """
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
     count = len(x)

@@ -1,5 +1,5 @@
-"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are the same, in closed form, on data that is
-shuffled once.
+"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are rsl-rl's, but losses are written in closed
+form and data is shuffled once per update.
 """
 
 import math
@@ -33,7 +33,8 @@ class DevicePPO(CriticWarmup):
     The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
     memory once per update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
     divergence are written out. The optimiser is fused. Losses are summed on the device and read once. An actor's estimator
-    learns from the same mini-batches. Where a feature needs rsl-rl's own update (`why_stock`), that one runs.
+    learns from the same mini-batches. If a feature needs rsl-rl's own update, `why_stock` names the feature and that update
+    runs.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -53,11 +54,11 @@ class DevicePPO(CriticWarmup):
         count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
         self._errors: EstimationErrors | None = None
         self._losses = torch.zeros(count + 1, device=self.device)
-        """Means over the mini-batches of the last update: the losses in the order of `LOSSES`, the estimates' square errors
-        by term if there is an estimator, and the share of mini-batches that were used."""
+        """Means over the mini-batches of the last update: the losses in the order of `LOSSES`, the square estimation error of
+        each term if there is an estimator, and the share of mini-batches that were used."""
         self._one = torch.ones((), device=self.device)
         self._critic_alone = False
-        """True while the update that runs, or is captured, changes the value function alone."""
+        """True while an update that changes the value function alone runs or is captured."""
         self.left_out = 0.0
         """Share of the last update's mini-batches that were skipped, because a gradient was NaN or infinite."""
 
@@ -65,8 +66,8 @@ class DevicePPO(CriticWarmup):
     """True if an update can be captured. Features that can't be captured use rsl-rl's own loop."""
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
-        """Set the measure of the estimates' errors and the learning rate of the actor's estimator. Call this once, before the
-        first update.
+        """Set the object that measures estimation errors, and the learning rate of the actor's estimator. Call this once,
+        before the first update.
         """
         self._errors = errors
         self._losses = torch.zeros(len(self._losses) + len(errors.names), device=self.device)
@@ -99,9 +100,7 @@ class DevicePPO(CriticWarmup):
         return [*models, *moments, self._rate]
 
     def _why_stock(self) -> str:
-        """Return the first feature that only rsl-rl's own update supports; empty without one. A configuration can ask
-        for each of them.
-        """
+        """Return the first configured feature that only rsl-rl's own update supports, or an empty text."""
         if self.symmetry and self.symmetry.use_mirror_loss:
             return "a mirror loss"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
@@ -129,7 +128,7 @@ class DevicePPO(CriticWarmup):
         """Load a checkpoint of this class or of rsl-rl's PPO."""
         rates = [group["lr"] for group in self.optimizer.param_groups]
         iteration = super().load(loaded_dict, load_cfg, strict)
-        if self._rate is not None:  # loading replaces the tensor by the saved number
+        if self._rate is not None:  # loading has replaced the tensor by the saved number
             groups = self.optimizer.param_groups
             self._rate.fill_(groups[0]["lr"])
             for group, rate in zip(groups, (self._rate, *rates[1:]), strict=True):
@@ -139,8 +138,8 @@ class DevicePPO(CriticWarmup):
         return iteration
 
     def save(self) -> dict:
-        """Return the parts of a checkpoint in rsl-rl's form, whose optimiser is not fused and has its learning rate and step
-        counts on the host.
+        """Return the parts of a checkpoint in rsl-rl's form: the optimiser is not fused, and its learning rate and step
+        counts are on the host.
         """
         saved = super().save()
         if self._rate is not None:
@@ -198,8 +197,8 @@ class DevicePPO(CriticWarmup):
         return {"losses": self._losses, "std": self.action_std(), **rate}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`;
-        without `numbers`, the results of the last update are read from the device.
+        """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`. If
+        `numbers` is None, the results of the last update are read from the device.
 
         Losses are NaN if all mini-batches were skipped. The root mean square errors of the estimates follow as
         `Estimator/<term>_rmse`, each in the term's unit.
@@ -217,8 +216,8 @@ class DevicePPO(CriticWarmup):
         actions (n, D), the old log-probabilities, advantages, old values and returns (n,), and the mean and standard
         deviation (n, D) of the old Gaussian.
 
-        With symmetry, the mirror images follow the samples, in all but the last two: 2 n rows. With an estimator, its targets
-        (n or 2 n, E) come last.
+        With symmetry, all but the mean and standard deviation have 2 n rows, because the mirror images follow the samples.
+        With an estimator, its targets (n or 2 n, E) come last.
         """
         st = self.storage
         observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
@@ -246,7 +245,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples. It comes from a sort, which a graph can hold."""
+        """Return a random permutation of `count` samples. It comes from a sort, because a graph can hold a sort."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -285,8 +284,8 @@ class DevicePPO(CriticWarmup):
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         errors: tuple[Tensor, ...] = ()
         if targets is not None and estimates is not None:
-            # One backward pass serves both losses. They share no parameter but the hidden layers of an estimator with a
-            # latent.
+            # One backward pass serves both losses. The only parameters that they share are the hidden layers of an estimator
+            # with free outputs.
             loss = loss + (estimates - targets).square().mean()
             assert self._errors is not None
             errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()
@@ -298,7 +297,7 @@ class DevicePPO(CriticWarmup):
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         losses.insert(LOSSES.index("kl"), kl)  # this tensor is averaged over the processes below
-        # The clipped value loss has no gradient for a value that is NaN, so its own value is checked as well.
+        # A NaN value gives the clipped value loss no gradient, so the loss itself is checked as well.
         valued = value_loss.detach().clone()
         if self._critic_alone:
             loss = self.value_loss_coef * value_loss
@@ -331,7 +330,7 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # the gradient: with several processes, a view of the shared buffer
+        for parameter, gradient in of_actor:  # with several processes a view of the shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 

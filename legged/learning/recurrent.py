@@ -11,7 +11,7 @@ GATES = {4: "lstm", 3: "gru"}
 
 
 def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:
-    """Return the hidden states (layers, N, width) of the recurrent ones among rsl-rl's `networks`, by name and number. A
+    """Return the hidden states (layers, N, width) of those of rsl-rl's `networks` that are recurrent, as `<name>_<number>`. A
     missing state is created as zeros.
     """
     found: dict[str, Tensor] = {}
@@ -31,9 +31,9 @@ def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tenso
 def keep_shape_of_one_robot(policy: Any) -> None:
     """Make a recurrent policy of rsl-rl return the log-probabilities of T steps of one robot as (T,).
 
-    If a mini-batch has a single robot, rsl-rl stores the old log-probabilities in that shape. Its update would broadcast (T,
-    1) and (T,) to (T, T), the ratio of every step to every other. Log-probabilities of several robots, (T, n), and of one
-    step, (N,), stay unchanged.
+    If a mini-batch has a single robot, rsl-rl squeezes the old log-probabilities to (T,), but the new ones are (T, 1). Their
+    ratio would be broadcast to (T, T), every step with every other step. Log-probabilities of several robots, (T, n), and of
+    one step, (N,), stay unchanged.
     """
     ask = policy.get_output_log_prob
 

@@ -29,7 +29,7 @@ def resumed(
     All errors are found here, before anything is built.
 
     Raises:
-        ConfigError: there is no such run, it has another task, robot, observation or network, or it has finished.
+        ConfigError: there is no such run, its task, robot, observations or networks differ, or it has finished.
     """
     asked = list(asked)
     folders = [(key, value) for key, value in asked if key == "train.runner.experiment_name"]

@@ -11,7 +11,7 @@ from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
 class Steps(ABC):
-    """Rollout of T control steps, as in rsl-rl's training loop, in one function that a graph can hold. A subclass computes
+    """Rollout of T control steps as in rsl-rl's training loop, but as one function that a graph can hold. A subclass computes
     the actions (`_act`), and the quantities that need all steps (`_finish`).
     """
 
@@ -119,7 +119,7 @@ class Rollout(Steps):
         st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
         if alg.reward_scale != 1.0:
             st.rewards.mul_(alg.reward_scale)
-        # At a time-out, the value of the state that was acted on replaces that of the next state, as in rsl-rl.
+        # At a time-out the next state is a new episode's, so the value of the state before it is used, as in rsl-rl.
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
         self._returns()
 
@@ -129,7 +129,7 @@ class Rollout(Steps):
         last = alg.critic.mlp(alg.critic.get_latent(self._observations))
         following = torch.cat([st.values[1:], last.unsqueeze(0)])
         alive = 1.0 - st.dones.float()
-        sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences; the loop adds later ones
+        sums = st.rewards + alive * alg.gamma * following - st.values  # temporal differences
         decay = alive * (alg.gamma * alg.lam)
         for t in reversed(range(len(sums) - 1)):
             sums[t].add_(decay[t] * sums[t + 1])

@@ -34,17 +34,17 @@ GIT_S = 30.0
 
 
 def experiment_folder(cfg: TaskConfig) -> Path:
-    """Return the folder of a task's runs. The configuration allows plain names only, so it lies in logs/."""
+    """Return the folder of a task's runs. The folder lies in logs/, because the configuration allows only plain names."""
     return LOGS / (cfg.train.runner.experiment_name or cfg.task)
 
 
 def create_run(cfg: TaskConfig) -> Path:
     """Make a new run folder with the resolved configuration and the state of the code. Two processes never get the same
-    folder, even in the same second.
+    folder, even if they start in the same second.
 
     Raises:
-        ConfigError: its name is not a valid folder name.
-        RunError: it can't be made or written.
+        ConfigError: the run's name is not a valid folder name.
+        RunError: the folder can't be made, or a file can't be written.
     """
     parent = experiment_folder(cfg)
     folder = parent / stamped(cfg)
@@ -66,14 +66,14 @@ def create_run(cfg: TaskConfig) -> Path:
 
 
 def stamped(cfg: TaskConfig) -> str:
-    """Return the name of a run that begins now: date and time, and the run's own name if it has one."""
+    """Return the folder name of a run that begins now: date and time, then `run_name` if it is set."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     return f"{stamp}_{cfg.train.runner.run_name}" if cfg.train.runner.run_name else stamp
 
 
 def discard_run(folder: Path) -> None:
     """Remove the folder of a run that failed before its first checkpoint, and parent folders that are then empty. Keep a
-    folder that holds anything else.
+    folder that holds files of other origin.
 
     A state file without its checkpoint is removed too, because it is of no use.
     """
@@ -210,7 +210,7 @@ def own_run(name: str, where: str) -> Path:
 
 
 def newest_run(where: str) -> Path:
-    """Return the run folder in logs/ that began or wrote a checkpoint last.
+    """Return the run folder in logs/ with the latest checkpoint; a run without a checkpoint counts by its start.
 
     Raises:
         ConfigError: there is no run.
@@ -226,15 +226,15 @@ def _has_begun(folder: Path) -> bool:
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
-    """Return a checkpoint of a run folder: that of the iteration `checkpoint`, the best one of the evaluations during
-    training (BEST), or by default the latest.
+    """Return a checkpoint of a run folder. `checkpoint` is its iteration, or BEST for the best one of the evaluations during
+    training, or None for the latest.
 
     Raises:
         ConfigError: the folder has no such checkpoint.
     """
     if checkpoint == BEST:
         if not (folder / BEST_MODEL).is_file():
-            keeping = "with train.runner.evaluate_interval a training keeps it"
+            keeping = "with train.runner.evaluate_interval a training writes it"
             raise ConfigError(f"--checkpoint: {relative(folder)} has no {BEST_MODEL}; {keeping}")
         return folder / BEST_MODEL
     found = checkpoints(folder)
@@ -249,9 +249,9 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
 
 
 def of_another_policy(folder: Path, checkpoint: object) -> bool:
-    """Return True if an evaluation of the file `checkpoint` does not describe the last policy in its folder: the training has
-    gone on since, or the evaluation was made of another checkpoint. Shipped policies never count, because their original file
-    name is unknown.
+    """Return True if the file `checkpoint`, which was evaluated, is not the last policy in `folder`: the training has gone on
+    since, or an earlier checkpoint was evaluated. For a shipped policy return False, because its original file name is
+    unknown.
     """
     found = checkpoints(folder)
     last = found[max(found)].name if found else SHIPPED_MODEL
@@ -268,7 +268,7 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
     """Return the configuration with which a run was trained. `where` is the argument that named the run.
 
     Raises:
-        ConfigError: the folder has none, or it no longer fits the schema.
+        ConfigError: the folder has no configuration, or the configuration no longer fits the schema.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():

@@ -1,7 +1,8 @@
 """State of a training beyond its checkpoint: random generators, robots, episodes. With this state a resumed training
 continues as if it had never stopped. Without it, robots start anew.
 
-The state grows with the number of robots, so only the newest is kept: state_<iteration>.pt next to model_<iteration>.pt.
+The state's size grows with the number of robots, so only the newest state is kept: state_<iteration>.pt next to
+model_<iteration>.pt.
 """
 
 import random
@@ -38,12 +39,12 @@ they would still have the old values."""
 
 
 def state_path(checkpoint: Path) -> Path:
-    """Return the path of the state of a checkpoint, which may not exist."""
+    """Return the path of a checkpoint's state file, which need not exist."""
     return checkpoint.with_name(checkpoint.name.replace("model", "state", 1))
 
 
 def write_run_state(checkpoint: Path, state: dict[str, Any]) -> None:
-    """Write the state of a checkpoint. This comes before the checkpoint itself, so that the newest checkpoint always has a
+    """Write the state of a checkpoint. Call this before the checkpoint is written, so that the newest checkpoint always has a
     state.
     """
     write_checkpoint(state_path(checkpoint), {"format": FORMAT, **state})

@@ -1,4 +1,4 @@
-"""rsl-rl's OnPolicyRunner, extended by task state in checkpoints, safe files and a clean stop."""
+"""rsl-rl's OnPolicyRunner, with the task's state in checkpoints, atomic writes and a clean stop."""
 
 import contextlib
 import io
@@ -54,7 +54,7 @@ def runner_config(task: BaseTask, algorithm_class: str) -> dict[str, Any]:
     """Return rsl-rl's configuration dictionary.
 
     Raises:
-        ConfigError: the task has no mirror images, but is to learn from them.
+        ConfigError: the configuration asks for mirror images, but the task has none.
     """
     cfg, runner = task.cfg, task.cfg.train.runner
     settings = {name: value for name, value in vars(cfg.train.algorithm).items() if name != "class_name"}
@@ -83,7 +83,7 @@ def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": runner.logger,
-        "check_for_nan": False,  # the check would wait for the GPU at every step; the task itself ends and counts such robots
+        "check_for_nan": False,  # it would wait for the GPU at every step; the task itself resets and counts such robots
     }
 
 
@@ -107,7 +107,7 @@ class Runner(OnPolicyRunner):
         self._transferred_from: dict[str, Any] | None = None
         self._last_saved = ""
         self.evaluations: Evaluations | None = None
-        """Evaluations of the policy during training. Of several processes, only the first has them."""
+        """Evaluations of the policy during training. With several processes, only the first has them."""
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
         if self.alg.get_policy().is_recurrent:
             keep_shape_of_one_robot(self.alg.get_policy())
@@ -143,14 +143,16 @@ class Runner(OnPolicyRunner):
         self.logger.stop_requested = True
 
     def evaluate_with(self, evaluations: Evaluations | None) -> None:
-        """Set the evaluations of the policy during training. In a group of processes, all but the first pass None."""
+        """Set the evaluations of the policy during training. With several processes, only the first passes evaluations, and
+        the others pass None.
+        """
         self.evaluations = evaluations
         self.logger.why_end = lambda: "" if evaluations is None else evaluations.why_end
         if evaluations is not None:
             self.logger.evaluate = self._evaluate
 
     def _evaluate(self, iterations: int, total: int) -> dict[str, float]:
-        """Evaluate the policy if that is due, keep it if it is the best, and return the figures."""
+        """Evaluate the policy if an evaluation is due, save the policy if it is the best so far, and return the figures."""
         evaluations, logger = self.evaluations, self.logger
         assert evaluations is not None
         if not evaluations.due(iterations, total, logger.loop_s):
@@ -167,18 +169,18 @@ class Runner(OnPolicyRunner):
 
     def train(self, until_iteration: int) -> bool:
         """Train up to iteration `until_iteration` or to the target, and leave a checkpoint. Return False if the training was
-        stopped before. At the end, leave the group of processes.
+        stopped earlier. At the end, leave the process group.
 
         Raises:
             RankLost: another process has died.
-            Diverged: numbers were NaN or infinite for too long; the last checkpoint is good.
+            Diverged: numbers were NaN or infinite for too long. The last checkpoint is not affected.
         """
         finished = True
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # Only a target ends a training of several processes. A process without evaluations learns of it from the first
-            # one.
+            # With several processes only a reached target raises Ended. A process without evaluations learns of it from the
+            # first one.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -190,16 +192,14 @@ class Runner(OnPolicyRunner):
             good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
             raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
-            if self.is_distributed and "by peer" in str(error):  # gloo's report; for NCCL, torchrun reports
+            if self.is_distributed and "by peer" in str(error):  # gloo's text; NCCL's case torchrun reports
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
             raise
         leave()
         return finished
 
     def _configure_multi_gpu(self) -> None:
-        """Join the group of processes, as rsl-rl does, but on the CPU too, and with the device that torchrun gave each
-        process.
-        """
+        """Join the process group as rsl-rl does, but on the CPU too, and with the device that torchrun gave each process."""
         ranks = Ranks.now()
         self.is_distributed = ranks.several
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.count, ranks.rank, ranks.local_rank
@@ -226,7 +226,7 @@ class Runner(OnPolicyRunner):
             RunError: weights are NaN or infinite, or a file can't be written.
         """
         saved = self._content(Path(path), infos)
-        if not self.is_distributed:  # the robots of the other processes are not here
+        if not self.is_distributed:  # this process lacks the others' robots
             saved["infos"]["id"] = uuid4().hex
             state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
             state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
@@ -281,11 +281,11 @@ class Runner(OnPolicyRunner):
         return infos
 
     def _load_learner(self, path: Path, saved: dict[str, Any], parts: dict | None = None, strict: bool = True) -> None:
-        """Load networks, optimiser (if there is one) and learning rate from the content of a checkpoint, or only those
-        `parts`.
+        """Load networks, optimiser (if there is one) and learning rate from the content of a checkpoint. `parts` limits what
+        is loaded.
 
         Raises:
-            ConfigError: they do not fit.
+            ConfigError: the content does not fit.
         """
         parts = parts or {"actor": True, "critic": "critic_state_dict" in saved, "iteration": True}
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
@@ -301,7 +301,7 @@ class Runner(OnPolicyRunner):
             raise ConfigError(describe_mismatch(path, saved, policy, self.env.cfg.task)) from error
 
     def _set_rate(self, saved: float) -> None:
-        """Set the learning rate: that of the checkpoint if it adapts, that of the configuration if it is fixed."""
+        """Set the learning rate: the `saved` one if the schedule is adaptive, the configuration's if it is fixed."""
         settings = self.env.cfg.train.algorithm
         self.alg.learning_rate = settings.learning_rate if settings.schedule == "fixed" else saved
         first = self.alg.optimizer.param_groups[0]  # the estimator's group, which comes next, keeps its own rate

@@ -45,7 +45,7 @@ class StudentRunner(CapturedRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations."""
-        if self.why_stock:  # rsl-rl's update starts from the hidden state after the last one
+        if self.why_stock:  # rsl-rl's update starts from this hidden state
             self.alg.last_hidden_states = (self.alg.student.get_hidden_state(), None)
         super().learn(num_learning_iterations, init_at_random_ep_len)
 
@@ -81,5 +81,5 @@ class StudentRunner(CapturedRunner):
         return saved
 
     def _set_rate(self, saved: float) -> None:
-        """Set the learning rate of the configuration. A student's rate does not adapt, and has its own setting."""
+        """Set the learning rate of the configuration. A student's learning rate is constant and has its own setting."""
         self.alg.learning_rate = self.alg.optimizer.param_groups[0]["lr"] = self.env.cfg.train.distillation.learning_rate

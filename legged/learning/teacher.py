@@ -1,4 +1,4 @@
-"""Teacher of a student: any policy of this package, with the observations that it was trained on."""
+"""Teacher of a student: any policy of this package, with the observations that the policy was trained on."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ from legged.registry import task_class
 
 FIELD = "train.distillation.teacher"
 PREFIX = "teacher_"
-"""Prefix of the names of a teacher's observation groups in its student's task."""
+"""Prefix that the names of a teacher's observation groups get in the student's task."""
 OF_A_NETWORK = ("activation", "obs_normalization", "noise_std_type", "state_dependent_std", "rnn_type")
 OF_ACTIONS = ("control_type", "action_scale", "held", "clip_actions")
 """Fields of `control` that define the meaning of an action."""
@@ -65,7 +65,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     teacher was trained on.
 
     Raises:
-        ConfigError: there is no teacher, or its observations or actions differ.
+        ConfigError: there is no teacher, or the teacher's observations or actions differ from the student's task.
     """
     name, where = cfg.train.distillation.teacher, cfg.origins.where(FIELD)
     if not name:
@@ -96,8 +96,8 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
 
 
 def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> list[str]:
-    """Return a line such as 'observations.clip 100 there, 10 here' for each setting that changes the values of the `terms` or
-    the effect of actions, and that differs between the student's task and the teacher's.
+    """Return a line such as 'observations.clip 100 there, 10 here' for each setting that differs between the student's task
+    (`here`) and the teacher's (`there`). Only settings that affect the `terms` or the actions are compared.
     """
     pairs: dict[str, tuple[Any, Any]] = {"the control step": (here.dt, there.dt)}
     for name in OF_ACTIONS:
@@ -134,7 +134,7 @@ def _largest_forces(cfg: TaskConfig) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as text for an error. A long list is given by its length and its ends."""
+    """Return a value as text for an error. A long list is given by its length, and numbers also by the first and last."""
     if isinstance(value, tuple) and len(value) > 3:
         return f"{len(value)} from {value[0]:g} to {value[-1]:g}" if isinstance(value[0], float) else f"{len(value)} names"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -159,7 +159,8 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
         if groups.get(name, group) != group:
             where = cfg.origins.where(f"observations.groups.{name}")
             raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
-    # A student has no value function and does not learn from mirror images. The teacher's observations therefore need none.
+    # A student has no value function and does not learn from mirror images, so the teacher's observations need no mirror
+    # kind.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
     return replace(
         cfg,

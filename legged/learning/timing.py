@@ -22,14 +22,14 @@ class Timing:
     robots: int
     """Robots of all processes."""
     iterations: int
-    """Iterations made by this process. A resumed training has earlier ones, made by other processes."""
+    """Iterations made by this process, without the earlier iterations of a resumed training."""
     resumed: bool
     steps: int
     """Control steps of all robots."""
     start_up_s: float
     """Time until everything was built, with imports and the compilation of kernels [s]."""
     loop_s: float
-    """Time in iterations. It includes logging, except in rsl-rl's own loop [s]."""
+    """Time in iterations [s]. It includes logging, except in rsl-rl's own loop."""
     wall_s: float
     """Time since the start of the process [s]. It includes the two times above, the capture of graphs, checkpoints and
     evaluations.
@@ -38,10 +38,10 @@ class Timing:
     kernels_compiled: int
     """Number of Warp modules that were compiled, because Warp's cache lacked them."""
     beside: int = 0
-    """Largest number of other trainings seen at one time on the same device; with several GPUs, on that of the first process.
-    """
+    """Largest number of other trainings seen at one time on the same device. With several GPUs, only the first process's GPU
+    counts."""
     error: str = ""
-    """Cause of the end, in one line; empty if that was the last iteration or a signal."""
+    """Cause of the end, in one line; empty if the training ended at its last iteration or by a signal."""
     evaluation_s: float = 0.0
     """Time in evaluations during training [s]."""
 

@@ -21,7 +21,7 @@ TENSORBOARD = "tensorboard"
 FLUSH_S = 10
 """Interval at which TensorBoard's file is written [s]."""
 SECONDS = "/time"
-"""Ending of the tags whose steps are seconds. Trackers count iterations, so they don't get these."""
+"""Ending of the tags that are logged over seconds instead of iterations. Trackers don't get these tags."""
 FILES = ("config.yaml", "code.diff", "timing.json", "report.html", "report.md", "evaluation_*.json", "*.gif", "*.png")
 """Files of a run folder that a tracker gets at the end, in addition to videos."""
 
@@ -30,7 +30,7 @@ def check_tracker(cfg: TaskConfig) -> None:
     """Check that the configured tracker is available.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: the tracker is unknown or not installed, or is not a writer.
     """
     if cfg.train.runner.logger != TENSORBOARD:
         _writer_class(cfg)
@@ -81,7 +81,7 @@ def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
     try:
         writer = kind(**given)
         writer.store_config(_Plain(to_dict(cfg)), to_dict(cfg.train))
-    except Exception as error:  # each tracker raises its own types
+    except Exception as error:  # each tracker raises its own error types
         text = " ".join(str(error).split()) or type(error).__name__
         raise RunError(f"train.runner.logger: {runner.logger} does not start: {text[:300]}") from error
     return Tracker(writer, folder)
@@ -98,7 +98,7 @@ class _Plain:
 
 
 class Tracker(LogWriter):
-    """Writer to TensorBoard and a tracker. After the first failure it prints a warning and leaves the tracker out."""
+    """Writer to TensorBoard and a tracker. If the tracker fails once, it is left out from then on, after a warning."""
 
     def __init__(self, writer: LogWriter, folder: str) -> None:
         """Take the tracker's `writer`, which may write TensorBoard's file itself, as rsl-rl's writers do."""

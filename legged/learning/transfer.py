@@ -74,8 +74,8 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def transferable_parts(saved: Saved, cfg: TaskConfig) -> Saved:
-    """Return the parts of a checkpoint with which a training of `cfg` begins: all parts, or only the policy if the value
-    function learns alone at first.
+    """Return the parts of a checkpoint with which a training of `cfg` begins: all parts, or only the policy if a new value
+    function is to be trained first.
     """
     if not cfg.train.algorithm.critic_warmup_iterations:
         return saved
@@ -84,7 +84,7 @@ def transferable_parts(saved: Saved, cfg: TaskConfig) -> Saved:
 
 
 def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
-    """Compare the observations and actions of a built task with those of a checkpoint, with their widths.
+    """Compare the observations and actions of a built task, including their widths, with those of a checkpoint.
 
     Raises:
         ConfigError: they differ.
@@ -134,7 +134,7 @@ def _check_observations(
     """Compare the groups that `networks` read, term by term.
 
     Raises:
-        ConfigError: some differ; the text gives the first difference of each.
+        ConfigError: groups differ. The text gives the first difference of each group.
     """
     differences = []
     for name in dict.fromkeys(group for network in networks for group in groups_of(cfg, network)):

@@ -7,14 +7,13 @@ from contextlib import contextmanager
 import torch
 
 SLOWER = 1.3
-"""Factor by which an update must exceed the best time, with the same number of threads, to show that the machine is shared.
-"""
+"""The machine counts as shared if an update takes this many times the best time with the same number of threads."""
 LOOK_AGAIN = 20
 """Number of updates with one thread, after which all threads are tried again."""
 
 
 class UpdateThreads:
-    """Chooser of torch's number of threads for each update, based on the times of the last updates.
+    """Chooser of the number of torch threads for the next update. It compares the times of the last updates.
 
     With several threads an operation ends when the slowest thread gets its core. If another program takes one core of two,
     one thread is faster. The results do not depend on the number of threads (cpu_layers.py).
@@ -31,8 +30,8 @@ class UpdateThreads:
 
     @contextmanager
     def use(self) -> Iterator[None]:
-        """Run an update in the block with the chosen number of threads. Elsewhere torch uses one thread, and the other cores
-        do physics.
+        """Run an update in the block with the chosen number of threads. Outside the block torch uses one thread, and the
+        other cores do physics.
         """
         before = torch.get_num_threads()
         torch.set_num_threads(self.count)

@@ -1,4 +1,4 @@
-"""Motors that are not ideal: delay of targets, torque-speed line, friction of joints, actuators learned from data.
+"""Models of motors that are not ideal: delay of targets, torque-speed line, friction of joints, actuators learned from data.
 
 The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to zero at the no-load
 speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same line).
@@ -33,17 +33,17 @@ speed from the line. With a larger gain the speed diverges."""
 
 
 def is_ideal(cfg: ActuatorConfig) -> bool:
-    """Return whether motors give the torque of the control law at once, up to their effort limit."""
+    """Return True if motors give the torque of the control law without delay and losses, up to their effort limit."""
     friction = any(any(table.values()) for table in (cfg.coulomb_friction, cfg.breakaway_friction, cfg.viscous_friction))
     return cfg.model == "ideal" and not friction and cfg.delay == (0, 0) and not cfg.network
 
 
 class MotorCurve:
-    """Torque-speed lines of the motors of D joints, which limit the torque at a velocity."""
+    """Torque-speed lines of the motors of D joints. They limit the torque at each velocity."""
 
     def __init__(self, stall_torque: Tensor, no_load_speed: Tensor) -> None:
-        """Set the torque at rest [N m] and the speed at which the torque is zero [rad/s], (D,) each. A motor is ideal if both
-        are infinite: only the effort limit of its joint limits its torque.
+        """Set the torque at rest [N m] and the speed at which the torque is zero [rad/s], (D,) each. If both are infinite the
+        motor is ideal, and only the effort limit of the joint limits its torque.
         """
         self.stall_torque, self.no_load_speed = stall_torque, no_load_speed
         """(D,) each. No-load speeds become (N, D) at the first call of `vary`."""
@@ -74,9 +74,9 @@ class Friction:
     def __init__(
         self, coulomb: Tensor, breakaway: Tensor, viscous: Tensor, stribeck_velocity: float, smoothing: float
     ) -> None:
-        """Set the coefficients, (D,) each: `coulomb` is the friction of a moving joint and `breakaway` that at the start of a
-        motion [N m]; `viscous` is in [N m s/rad]. Friction falls from `breakaway` to `coulomb` over `stribeck_velocity`, and
-        fades to zero below the speed `smoothing` [rad/s].
+        """Set the coefficients, (D,) each: `coulomb` is the friction of a moving joint [N m], `breakaway` the friction at the
+        start of a motion [N m], and `viscous` a factor on the speed [N m s/rad]. Friction falls from `breakaway` to `coulomb`
+        over `stribeck_velocity`, and fades to zero below the speed `smoothing` [rad/s].
         """
         self.coulomb, self.extra, self.viscous = coulomb, breakaway - coulomb, viscous
         self.stribeck_velocity, self.smoothing = stribeck_velocity, smoothing
@@ -90,9 +90,9 @@ class Friction:
 class Actuator:
     """Actuators of N robots with D joints: delay, motor and friction between targets and joint torques.
 
-    A target is set once per control step. It reaches the law after the robot's delay, in physics steps; before the first
-    target arrives, joints have the target of action 0. The torque of the law is limited to that of the motor, then friction
-    is subtracted.
+    A target is set once per control step. The target reaches the control law after the robot's delay, in physics steps. Until
+    the first target arrives, joints have the target of action 0. The law's torque is limited to the motor's, then friction is
+    subtracted.
     """
 
     STATE: tuple[str, ...] = ("targets", "delay")
@@ -132,7 +132,7 @@ class Actuator:
         self._has_curve = actuator.model == "dc_motor"
         low, high = actuator.delay
         self.shortest, self.longest = low, high
-        """Range of the delay, in physics steps, ends included."""
+        """Shortest and longest delay, in physics steps."""
         kept = 1 + math.ceil(high / cfg.decimation)
         self.targets = middle.expand(kept, n, joints).clone()
         """(K, N, D) targets of the last K control steps, newest first."""
@@ -152,7 +152,7 @@ class Actuator:
             self.STATE = (*self.STATE, "past")
 
     def describe(self, joint: int) -> str:
-        """Return the properties of a joint's motor that are not ideal, in a few words."""
+        """Return the deviations of a joint's motor from an ideal motor, in a few words."""
         curve, friction, parts = self.curve, self.friction, []
         if self.network is not None and bool(self._by_network[joint]):
             parts.append(f"torque by a network ({self.network.kind})")
@@ -179,7 +179,7 @@ class Actuator:
         self._steps = 0
 
     def delayed(self) -> Tensor:
-        """Return the targets (N, D) that have arrived at this physics step."""
+        """Return the targets (N, D) that are in force at this physics step."""
         if not self.longest:
             return self.newest
         late = (self.delay - self._steps).clamp_(min=0) + (self.decimation - 1)
@@ -199,7 +199,7 @@ class Actuator:
         each.
 
         `law` computes the commanded torques (N, D) from targets (N, D). For the P law, `gains` are its stiffness and damping.
-        `effort` are the effort limits of the joints [N m]. Gains and limits are (D,) or (N, D).
+        `effort` holds the effort limits of the joints [N m]. Gains and limits are (D,) or (N, D).
         """
         if self._kernels is not None and gains is not None and self.network is None:
             curve, friction = self.curve, self.friction
@@ -235,7 +235,7 @@ class Actuator:
         """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
-            if self._varies:  # a target that arrived by the last physics step stays in force, however late the next one is
+            if self._varies:  # a target that has arrived stays in force
                 latest = (torch.div(self.delay, self.decimation, rounding_mode="floor") + 1) * self.decimation
                 torch.where(mask, drawn, torch.minimum(drawn, latest), out=self.delay)
             else:
@@ -247,8 +247,8 @@ class Actuator:
 
 
 def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the indices of the joints that have the motor model, and the network if there is one. `where` turns a dotted
-    path into the beginning of an error message.
+    """Return the indices of the joints to which the motor model, and the network if there is one, applies. `where` turns a
+    dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -310,8 +310,8 @@ def friction_numbers(
 
 
 def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np.ndarray) -> np.ndarray:
-    """Return a number for each joint, (D,): the entry of the longest pattern of `table` in the joint's name, else that of
-    `otherwise` (D,).
+    """Return a number for each joint, (D,): the entry of the longest pattern of `table` in the joint's name, else the entry
+    of `otherwise` (D,).
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -340,8 +340,8 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that ideal motors are given no torque-speed line by mistake. The command line may set the model to `ideal` where
-    a file gives the numbers of a line, so that motors can be tried without it.
+    """Check that no torque-speed line is given to ideal motors by mistake. The command line may set the model to `ideal`
+    where a file gives the numbers of a line, so that motors can be tried without it.
 
     Raises:
         ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and
@@ -354,7 +354,7 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
         where = f"control.actuator.{name}"
         if told == "the default" or (origins.of(where) == "command line" and told != "command line"):
             raise ConfigError(
-                f"{origins.where(where)}: only motors with a torque-speed line have it, and these are ideal: "
+                f"{origins.where(where)}: only motors with a torque-speed line use it, but these motors are ideal: "
                 f"set {path} to dc_motor, or to ideal if that is meant"
             )
 

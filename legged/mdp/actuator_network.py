@@ -2,8 +2,8 @@
 samples; an LSTM remembers all samples.
 
 The MLP is that of Hwangbo et al., "Learning agile and dynamic motor skills for legged robots", Science Robotics 4 (2019),
-eaau5872: position error and velocity of now and of two earlier samples, small layers with softsign. All joints share a
-network.
+eaau5872: its inputs are position error and velocity of the current and two earlier samples, and its small layers use
+softsign. All joints share one network.
 """
 
 from dataclasses import dataclass, field
@@ -39,7 +39,8 @@ class NetworkWeights:
     dt: float
     """Time between the samples that the network was trained on [s]."""
     samples: int
-    """Samples that an MLP sees: the current one and `samples - 1` earlier ones, `dt` apart. 1 for an LSTM."""
+    """Number of samples that an MLP sees: the current sample and `samples - 1` earlier ones, `dt` apart. It is 1 for an
+    LSTM."""
     scales: np.ndarray
     """(3,) factors on position errors [1/rad], on velocities [s/rad] and on the output [N m]."""
     layers: tuple[dict[str, np.ndarray], ...]
@@ -107,7 +108,7 @@ class NetworkWeights:
             ValueError: a layer does not fit the previous one, or has non-finite weights.
         """
         if not (self.dt > 0.0 and self.samples > 0 and self.scales.shape == (3,) and 0 < len(self.layers) <= DEEPEST):
-            raise ValueError("its header makes no sense")
+            raise ValueError("its header has invalid values")
         width = 2 * self.samples
         for i, layer in enumerate(self.layers):
             cell = self.kind == "lstm" and i + 1 < len(self.layers)
@@ -125,7 +126,7 @@ class NetworkWeights:
         """Return the number of physics steps of `sim_dt` [s] between two samples.
 
         Raises:
-            ConfigError: the number is not whole; or it is more than 1 for an LSTM, which sees every physics step.
+            ConfigError: the number is not whole, or is more than 1 for an LSTM, because an LSTM must see every physics step.
         """
         steps = round(self.dt / sim_dt)
         if steps < 1 or abs(self.dt / sim_dt - steps) > TOLERANCE or (self.kind == "lstm" and steps != 1):
@@ -165,10 +166,8 @@ class ActuatorNetwork:
         else:
             shape = (2 * len(self._hidden), max(self._hidden, default=1), joints)
         self.state = torch.zeros(num_envs, *shape, device=device)
-        """State of the network. MLP: (N, steps, 2, D) scaled errors and velocities of the last physics steps, newest first.
-        LSTM:
-        (N, 2 * cells, H, D), for each cell its hidden state, then its cell state.
-        """
+        """State of the network. For an MLP it is (N, steps, 2, D), the scaled errors and velocities of the last physics
+        steps, newest first. For an LSTM it is (N, 2 * layers, H, D), for each layer its hidden state, then its cell state."""
         if kernels is not None:
             widths = [2 * weights.samples, *(len(layer["bias"]) for layer in weights.layers)]
             widths[1:-1] = self._hidden or widths[1:-1]

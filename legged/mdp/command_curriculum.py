@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 class CommandCurriculum:
     """Curriculum that widens the range of each command axis (vx, vy, yaw rate) separately, while robots follow that axis.
 
-    Each axis is judged once per window, on the robots whose command exceeds half of the current range. The figure is their
-    mean velocity in the commanded direction, as a share of the commanded one. Unlike a tracking error, that share is not
-    blurred by the sway of a gait or by exploration, and standing still scores 0 however narrow the range is.
+    Each axis is judged once per window, by the robots whose command exceeds half of the current range. The measure is their
+    mean velocity in the commanded direction, as a share of the commanded velocity. The sway of a gait and exploration average
+    out in this share, but not in a tracking error. A robot that stands still scores 0, however narrow the range is.
     """
 
     STATE = ("share", "_sums", "_steps")
@@ -32,7 +32,7 @@ class CommandCurriculum:
         device = full_ranges.device
         self.share = torch.ones(3, device=device)
         """(3,) share of the full range that is in use."""
-        # Views of one tensor, so that clearing a window is one launch.
+        # These are views of one tensor, so that one launch clears a window.
         self._window = torch.zeros(7, device=device)
         self._sums = self._window[:6].view(2, 3)  # velocity reached in the commanded direction, commanded velocity
         self._steps = self._window[6]

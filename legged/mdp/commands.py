@@ -34,8 +34,8 @@ class Commands:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Set all commands to zero, due to be sampled at the first update. `dt` is the control step [s]. Random numbers come
-        from the pool `numbers`.
+        """Set all commands to zero. The first update samples them. `dt` is the control step [s]. Random numbers come from the
+        pool `numbers`.
         """
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
@@ -49,19 +49,19 @@ class Commands:
         self.time_left = torch.zeros(num_envs, device=device)
         """(N,) time until the next command is sampled [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) True for robots whose command was given by `hold` and is not sampled."""
+        """(N,) True for robots whose command was set by `hold`. It is not sampled any more."""
         self.steered = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) True for robots whose yaw rate steers towards their heading, in heading mode."""
         self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) True for robots whose command is to stand still. In heading mode, too, they do not turn."""
+        """(N,) True for robots whose command is to stand still. They do not turn, even in heading mode."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
         self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(0.0, 1.0, 3)
         self._heading = self.numbers.between(*cfg.ranges.heading, 1)
         self._chance = self.numbers.between(0.0, 1.0, 1)
-        # Kinds of commands: only vx, only vy, only yaw rate, all axes, none. Independent sampling of three axes hardly ever
-        # gives a command along one axis only.
+        # The kinds of commands are: only vx, only vy, only yaw rate, all axes, none. Some are along one axis on purpose,
+        # because independent sampling of three axes hardly ever gives such a command.
         single, standing = cfg.single_axis_share * (1.0 - cfg.standing_share) / 3.0, cfg.standing_share
         self._up_to = torch.tensor([single, 2.0 * single, 3.0 * single, 1.0 - standing], device=device)
         kept = torch.cat([torch.eye(3), torch.ones(1, 3), torch.zeros(1, 3)])
@@ -107,8 +107,8 @@ class Commands:
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
-        """Set fixed commands of all robots, (N, 3) or one (3,) for all; they are not sampled any more. With `heading` (N,)
-        [rad] and in heading mode, the yaw rate keeps steering towards it.
+        """Set fixed commands, (N, 3) or one (3,) for all robots. They are not sampled any more. With `heading` (N,) [rad] and
+        in heading mode, the yaw rate keeps steering towards that heading.
         """
         self.commands[:, :3].copy_(commands)
         self.held.fill_(True)

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""
 SHARE_OF_WEIGHT = 0.01
-"""Threshold of a contact for lighter robots, as a share of their weight, because a foot of a robot of 400 g never feels 1
-N."""
+"""Threshold of a contact for lighter robots, as a share of their weight. A robot of 400 g could hardly reach 1 N per foot."""
 GRAVITY = 9.81
 """Acceleration of gravity, for weights [m/s^2]."""
 
@@ -42,7 +41,7 @@ class FeetContacts:
     ) -> None:
         """Clear all times and contacts. `dt` is the control step [s]; `force` is the threshold of a contact [N]."""
         self.dt, self._kernels, self.force = dt, kernels, force
-        # Views of two tensors, so that a reset is two launches.
+        # These are views of two tensors, so that a reset takes two launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
         self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)

@@ -41,8 +41,8 @@ class Control:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Build the control law on the device of `torques` (N, D), the physics' own tensor, which the law writes. Gains come
-        from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
+        """Build the control law on the device of `torques` (N, D), the physics' tensor that the law writes. Gains come from
+        `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
             ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held by another law than P.
@@ -59,9 +59,8 @@ class Control:
         """Scale of all actions, or (A,) of each."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
-        """(D,) gains [N m/rad] and [N m s/rad]. They and `torque_limits` [N m] become (N, D) once `vary` has been given
-        values that differ from robot to robot.
-        """
+        """(D,) gains [N m/rad] and [N m s/rad]. These gains and `torque_limits` [N m] become (N, D) once `vary` randomises
+        any of them."""
         self.default_dof_pos = tensor(robot.default_dof_pos)
         self.torque_limits = tensor(robot.torque_limits)
         self._lowest_torques = -self.torque_limits
@@ -71,7 +70,7 @@ class Control:
         self.zero_dof_pos = self.default_dof_pos
         """(D,) or (N, D) true joint angles at which encoders show the default angles [rad]."""
         self.nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
-        """Nominal gains and limits (D,), by the names of `vary`, which multiplies them by its factors. They never change."""
+        """Name in `vary` -> nominal gains or limits (D,), which `vary` multiplies by its factors. They never change."""
         self._varied = False
         self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
@@ -86,8 +85,8 @@ class Control:
 
     def vary(self, drawn: Mapping[str, Tensor]) -> None:
         """Apply randomised properties, (N,) or (N, D) each: factors on gains and torque limits, and `joint_offset`, the error
-        of the encoders [rad]. Other fields of `physics.FIELDS` in `drawn` are ignored. The first call allocates for the
-        fields that it is given; later calls write in place.
+        of the encoders [rad]. Other fields of `physics.FIELDS` in `drawn` are ignored. The first call allocates tensors, and
+        later calls write in place.
         """
         each = {
             name: values.view(len(values), -1) for name, values in drawn.items() if name in (*self.nominal, "joint_offset")
@@ -118,7 +117,7 @@ class Control:
         if "torque_limit" in each:
             torch.neg(self.torque_limits, out=self._lowest_torques)
         if "joint_offset" in each:
-            # For a joint at q the law sees q + offset. That equals a target which is smaller by the offset.
+            # For a joint at q the law sees q + offset. A target that is smaller by the offset has the same effect.
             torch.sub(self.default_dof_pos, each["joint_offset"], out=self.zero_dof_pos)
 
     def set_actions(self, actions: Tensor) -> None:

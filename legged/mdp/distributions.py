@@ -34,9 +34,9 @@ class Distributions:
         steps_per_iteration: int = 1,
         within: bool = True,
     ) -> None:
-        """Configure the columns. A range with `grow` widens over training from the `neutral` value (V,) of its column: with
-        `within`, from the number in the range that is nearest to it; else from the value itself. `steps_per_iteration` are
-        the control steps of a training iteration.
+        """Configure the columns. A range with `grow` widens over training from the `neutral` value (V,) of its column. With
+        `within`, it starts from the number in the range that is nearest to that value. `steps_per_iteration` is the number of
+        control steps in a training iteration.
         """
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
         ordered = [columns[i] for i in self._order]
@@ -56,8 +56,8 @@ class Distributions:
         """(V,) bounds of the uniform numbers, sorted by distribution."""
         self._least, self._most = (tensor([draw.range[k] for draw in columns]) for k in range(2))
         self._pace: tuple[Tensor, Tensor] | None = None
-        """(V,) growth of each range in a step, and (V,) its width at the first step, as shares of the full width. None if no
-        range grows."""
+        """(V,) widening of each range in a step, and (V,) its width at the first step, as shares of the full width. None if
+        no range widens."""
         if any(draw.grow[1] > 0.0 for draw in columns):
             paces = [1.0 / (draw.grow[1] - draw.grow[0]) if draw.grow[1] > 0.0 else 0.0 for draw in columns]
             first = [-draw.grow[0] * pace if pace else 1.0 for draw, pace in zip(columns, paces, strict=True)]
@@ -71,9 +71,8 @@ class Distributions:
     def _table(self, columns: Sequence[DrawConfig]) -> tuple[Tensor, Tensor]:
         """Return the table of parameters (V, 8) and the index of each column's uniform number (V,).
 
-        A row holds: the distribution's index in `KINDS`; middle and spread of a normal distribution, else 0; both ends of
-        the range; the growth in a step and the share at the first step, or 0 and 1 for a range that does not grow; the
-        neutral value.
+        A row holds: the distribution's index in `KINDS`; middle and spread of a normal distribution, else 0; both ends of the
+        range; the widening in a step and the share at the first step, or 0 and 1 for a constant range; the neutral value.
         """
         count, like = len(columns), self.low
         source = torch.tensor([self._order.index(i) for i in range(count)], device=like.device)
@@ -89,7 +88,7 @@ class Distributions:
         return numbers.between(self.low, self.high, len(self.low))
 
     def at_once(self, count: int) -> Tensor:
-        """Draw (count, V) numbers outside a step. Ranges that grow have their initial width."""
+        """Draw (count, V) numbers outside a step. Ranges that widen have their initial width."""
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
 
@@ -102,7 +101,7 @@ class Distributions:
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
         """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.
-        Ranges have grown for `steps` () of training.
+        Ranges have widened for `steps` () of training.
         """
         parts = list(even.split(self._counts, dim=1))
         if self._counts[1]:
@@ -125,7 +124,7 @@ def _ends(draw: DrawConfig) -> tuple[float, float]:
     low, high = draw.range
     if draw.distribution == "log_uniform":
         return math.log(low), math.log(high)
-    if draw.distribution == "gaussian":  # torch.erfinv turns them into normal numbers, which would be infinite at +-1
+    if draw.distribution == "gaussian":  # torch.erfinv, which gives normal numbers, is infinite at +-1
         reach = 0.5 * (high - low) / standard_deviation(draw) if high > low else 0.0
         end = min(math.erf(reach / math.sqrt(2.0)), 1.0 - 1e-6)
         return -end, end

@@ -16,8 +16,8 @@ TURNS = ("roll", "pitch", "yaw")
 def _columns(
     cfg: KickConfig | ForceConfig, names: tuple[str, ...], times: tuple[str, ...]
 ) -> tuple[list[DrawConfig], list[float]]:
-    """Return the distribution of each random column of a disturbance, and the value that each range grows from. The columns
-    are its components `names`, whose ranges may grow from 0, then its `times`, whose ranges do not grow.
+    """Return the distribution of each random column of a disturbance, and the value that each range starts from. The columns
+    are first its components `names`, whose ranges may widen from 0, then its `times`, whose ranges are constant.
     """
     columns = [DrawConfig(range=getattr(cfg, name), grow=cfg.grow) for name in names]
     columns += [DrawConfig(range=getattr(cfg, name)) for name in times]
@@ -32,11 +32,11 @@ class Kicks:
     """Random columns of a kick: 6 for the change of velocity, 1 for the time until the next kick."""
 
     def __init__(self, cfg: KickConfig, dt: float, time_left: Tensor) -> None:
-        """Spread the first kicks over a whole interval. `dt` is the control step [s]; `time_left` (N,) is written in
+        """Spread the first kicks over the longest interval. `dt` is the control step [s]; `time_left` (N,) is written in
         place.
         """
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
-        """Distribution of each random column, and the value that its range grows from."""
+        """Distribution of each random column, and the value that its range starts from."""
         self._dt = dt
         self.time_left = time_left
         """(N,) time until the next kick [s]."""
@@ -68,7 +68,7 @@ class Forces:
         control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
         """
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
-        """Distribution of each random column, and the value that its range grows from."""
+        """Distribution of each random column, and the value that its range starts from."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
         """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) force now, world frame [N]."""
@@ -102,8 +102,8 @@ class Disturbances:
         steps_per_iteration: int,
         numbers: RandomPool,
     ) -> None:
-        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` are the control
-        steps of a training iteration, by which ranges grow. Random numbers come from the pool `numbers`.
+        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` is the number of
+        control steps in a training iteration; ranges widen by iterations. Random numbers come from the pool `numbers`.
         """
         self._dt, self._kernels = dt, physics.kernels
         num_envs, device = numbers.num_envs, numbers.device
@@ -129,7 +129,7 @@ class Disturbances:
         if not self._all:
             return
         self.steps = torch.zeros((), device=device)
-        """() control steps since training began, by which ranges grow."""
+        """() control steps since training began, which determine how far ranges have widened."""
         self.STATE = ("steps",)
         for k, part in enumerate(self._all):
             for name in part.STATE:
@@ -148,8 +148,8 @@ class Disturbances:
         self._no_forces = torch.zeros(num_envs, 0, 6, device=device)
 
     def draw(self) -> None:
-        """Draw the next disturbances of every robot. Runs on a parallel stream of the step; launches nothing without
-        disturbances.
+        """Draw the next disturbances of every robot. This runs on a parallel stream of the step, and does nothing if there
+        are no disturbances.
         """
         if self._all:
             self._draws.write(self._even.values, self.steps, self._drawn, self._kernels)
@@ -181,15 +181,15 @@ class Disturbances:
             force.force.zero_()
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the steps by which ranges have grown; empty without disturbances."""
+        """Return the number of steps for which ranges have widened; empty without disturbances."""
         return {"steps": self.steps.clone()} if self._all else {}
 
     def load_progress(self, progress: dict[str, Tensor]) -> None:
-        """Continue from the growth that `progress` returned."""
+        """Continue from the number of steps that `progress` returned."""
         if "steps" in progress and self._all:
             self.steps.copy_(progress["steps"])
 
 
 def body_number(physics: Physics, name: str) -> int:
-    """Return the index of a body in the physics' model. With an empty name, return that of the floating base."""
+    """Return the index of a body in the physics' model. An empty name means the floating base."""
     return int(physics.model.jnt_bodyid[0]) if not name else int(physics.model.body(name).id)

@@ -1,4 +1,4 @@
-"""Errors of the height map that a robot makes while it walks: offset, drift and holes."""
+"""Errors of the height map that a robot builds while it walks: offset, drift and holes."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def is_exact(cfg: HeightMapConfig) -> bool:
-    """Return whether the map has no errors."""
+    """Return True if the map has no errors."""
     return not (cfg.offset or cfg.shift or cfg.drift or cfg.shift_drift or cfg.holes or cfg.lost)
 
 
@@ -39,9 +39,9 @@ class HeightMapErrors:
     ) -> None:
         """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world frame.
 
-        If the map can be displaced horizontally, heights are looked up by `scan`, which must belong to this object alone;
-        otherwise the heights that `scan` holds are used. `seen` turns ground heights (N, P) in the world frame into the
-        observation. `dt` is the control step [s]. Random numbers come from the pool `numbers`.
+        If the map can be displaced horizontally, this object updates `scan`, so no other object may use it. Otherwise the
+        heights that `scan` holds are used. `seen` turns ground heights (N, P) in the world frame into the observation. `dt`
+        is the control step [s]. Random numbers come from the pool `numbers`.
         """
         self._scan, self._seen, self._kernels = scan, seen, kernels
         self._position, self._orientation = pose
@@ -80,7 +80,7 @@ class HeightMapErrors:
     def read(self) -> Tensor:
         """Return the observation (N, P) of the map's heights."""
         if self._moved:
-            # A map displaced by `error` shows at a place x the ground at x - error.
+            # At a place x, a map that is displaced by `error` shows the ground at x - error.
             torch.sub(self._position, self.error, out=self._place)
             self._scan.update(self._place, self._orientation)
         return torch.nan_to_num(self._seen(self._scan.heights + self.error[:, 2:]), nan=0.0)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 class HeightScan:
     """Ground heights at a grid of P points around each robot, turned with its heading. On a plane all heights are 0.
 
-    terrain.scan chooses how a point's height, and that of the ground under the base, follows from the cells around it
-    (HeightMap.scan_map).
+    terrain.scan chooses how the cells around a point give its height (HeightMap.scan_map). The ground under the base is such
+    a point too.
     """
 
     STATE: tuple[str, ...] = ()  # heights follow from the robots' poses

@@ -29,9 +29,10 @@ class Metrics:
         self._functions = dict(functions)
         self.reward_names, self.termination_names = tuple(reward_names), tuple(termination_names)
         self.reward_unit, self.num_envs = reward_unit, num_envs
-        # Sums by robot. `flush` adds up the robots, so that a step costs two launches for each table instead of three.
+        # Sums are kept by robot. `flush` adds up the robots, so that a step costs two launches for each table instead of
+        # three.
         self._metrics = torch.zeros(len(self._functions), num_envs, device=device)
-        # Rows: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
+        # The rows are: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
         self._counts = torch.zeros(3 + len(self.termination_names), num_envs, device=device)
         self._ended = torch.zeros(2, num_envs, device=device)  # episodes, falls
         self._lengths = torch.zeros(num_envs, device=device)
@@ -40,8 +41,8 @@ class Metrics:
         self._zero = torch.zeros((), device=device)
 
     def add_step(self, valid: Tensor, overflowed: Tensor, ended_by: Sequence[Tensor]) -> None:
-        """Add a step: the metrics of the robots of `valid` (N,), the number of robots of `overflowed` (N,), which lost
-        contacts, and the number of robots that each termination has ended, `ended_by` (N,) bool each.
+        """Add a step. Metrics count for the robots of `valid` (N,). `overflowed` (N,) marks robots that lost contacts, and
+        `ended_by` has for each termination a mask (N,) of the robots whose episodes it has ended.
 
         Raises:
             TermError: a metric fails, or does not return (N,).

@@ -31,10 +31,10 @@ each; `heights`: the height scan; `same`: numbers without a side; `scalar`: one 
 that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: a property of each joint that has no
 side, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
-"""Kind of term -> signs of its three numbers. A rotation is a pseudo-vector: it keeps its y."""
+"""Kind of term -> signs of its three numbers. A rotation is a pseudo-vector, so its y component keeps its sign."""
 
 Image = tuple[Tensor, Tensor]
-"""Mirror image as (columns, signs), each (width,): the image of `x` (n, width) is x[:, columns] * signs."""
+"""Mirror image as (columns, signs), each (width,). The image of `x` (n, width) is x[:, columns] * signs."""
 
 
 class MirrorImages:
@@ -55,7 +55,7 @@ class MirrorImages:
         joint of each action. `points` (P, 2) are the points of the height scan in the yaw frame [m].
 
         Raises:
-            ConfigError: a term has no kind, an unknown kind, or another number of columns than its kind.
+            ConfigError: a term has no kind, has an unknown kind, or has a width that does not fit its kind.
         """
         self._owner, self._kinds, self._mirror, self._points = owner, kinds, mirror, points.cpu()
         self._acted = acted
@@ -78,10 +78,10 @@ class MirrorImages:
         return (columns + steps).flatten().to(device), signs.repeat(group.history).to(device)
 
     def _term(self, name: str, width: int) -> Image:
-        """Return the image of a term, with columns counted from its first one.
+        """Return the image of a term. Its columns are counted from the term's first column.
 
         Raises:
-            ConfigError: it has no kind, or another number of columns than its kind.
+            ConfigError: the term has no kind, or its width does not fit its kind.
         """
         if name not in self._kinds:
             raise ConfigError(f"{self._owner}.MIRRORED does not say how observation '{name}' is mirrored")
@@ -93,8 +93,8 @@ class MirrorImages:
         return columns, signs
 
     def _image_of(self, kind: str, width: int) -> Image:
-        """Return the image of a kind of term. The kind determines the number of columns; only `same`, `vectors` and
-        `of_joints` look at `width`.
+        """Return the image of a kind of term. The kind determines the number of columns, except that `same`, `vectors` and
+        `of_joints` use `width`.
         """
         if kind in SIGNS:
             return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
@@ -129,8 +129,7 @@ class MirrorImages:
 
 
 def mirror_of_actions(mirror: Mirror, acted: Sequence[int]) -> tuple[list[int], list[float]] | None:
-    """Return, for each action of the joints `acted`, the index of the action whose place it takes in the mirror, and its
-    sign.
+    """Return, for each action of the joints `acted`, the index of the action on the other side, and the sign between the two.
 
     Return None if a joint has an action and its partner on the other side has none.
     """

@@ -1,4 +1,4 @@
-"""Handling of numbers that are NaN, infinite or larger than any robot's could be.
+"""Handling of numbers that are NaN, infinite or too large for any robot.
 
 One such number in a sample would reach every weight of the networks. Therefore such a reward or observation counts as 0, the
 robot's episode ends at the next step, and robots are counted by the term at fault. None of this waits for the host.
@@ -12,7 +12,7 @@ from torch import Tensor
 from legged.mdp.observations import ObservationTerms
 
 LARGEST = 1e10
-"""Rewards and observations beyond this count as infinite: the squares of sums of them must fit a float32."""
+"""Rewards and observations beyond this count as infinite, because squares of their sums must fit a float32."""
 LARGEST_STATE = 1e4
 """Bound on positions [m], velocities [m/s], angles [rad] and rates [rad/s]. Beyond it the physics has diverged."""
 
@@ -36,7 +36,7 @@ class NanGuard:
         self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
         self._seen = torch.zeros_like(self._now)
         self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
-        # Largest size of each observation column. It costs two launches per step. `flush` counts the robots.
+        # This records the largest size of each observation column, in two launches per step. `flush` counts the robots.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
@@ -67,7 +67,7 @@ class NanGuard:
 
     def flush(self) -> dict[str, Tensor]:
         """Return the number of robots with each fault as fresh 0-dimensional tensors, by name in TensorBoard, then clear the
-        record. A fault without robots has NaN.
+        record. The number is NaN for a fault that no robot had.
         """
         broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]
         counts = torch.cat([self._seen, ~self._rewards_finite, torch.stack(broken)]).sum(dim=1).float()

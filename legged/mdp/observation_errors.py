@@ -1,4 +1,4 @@
-"""Errors of observations: a constant bias within an episode, noise, delay, and loss.
+"""Errors of observations: a bias that is constant within an episode, noise, delay, and loss.
 
 Errors are applied to terms once per control step, so that all groups with noise see the same errors.
 """
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from legged.mdp.observations import ObservationTerms
 
 HEIGHTS = "heights"
-"""The term that is read from a map."""
+"""Name of the term that is read from a map."""
 
 
 class ObservationErrors:
@@ -41,9 +41,9 @@ class ObservationErrors:
     ) -> None:
         """Apply errors to the terms `names` of `source`. Each table has entries by term; a missing entry means no such error.
 
-        `bias` and `noise` are half widths of uniform distributions, in the term's unit. `delay` is the fewest and the most
-        control steps. `dropped` is the share of control steps at which a term is lost. Random numbers come from the pool
-        `numbers`. With `height_map`, the heights are read from it.
+        `bias` and `noise` are half widths of uniform distributions, in the term's unit. `delay` is the lowest and highest
+        number of control steps. `dropped` is the share of control steps at which a term is lost. Random numbers come from the
+        pool `numbers`. With `height_map`, the heights are read from that map.
         """
         self.columns, self.names = source.columns, tuple(sorted(names, key=lambda name: source.columns[name].start))
         self.noise = {name: noise.get(name, 0.0) for name in self.names}
@@ -86,7 +86,7 @@ class ObservationErrors:
         self._dropped = lost if lost.any() else None
         self._lost_drawn = numbers.between(0.0, 1.0, len(lost)) if lost.any() else None
         self.held = torch.zeros(num_envs, len(columns) if self._lost_drawn else 0, device=device)
-        """(N, C) numbers that arrived last; (N, 0) without loss."""
+        """(N, C) last numbers that were not lost; (N, 0) without loss."""
 
     def update(self, begun: Tensor, again: bool = False) -> None:
         """Update `values` for a new control step. Robots of `begun` (N,) have new episodes: they get a new bias and delay,

@@ -19,7 +19,7 @@ class ObservationTerms:
         """Call the function of each term once, to learn its width. Each returns (N, width).
 
         Raises:
-            TermError: a term fails, or returns something else than (N, width).
+            TermError: a term fails, or does not return (N, width).
             ValueError: there is no term.
         """
         self._functions = dict(functions)
@@ -47,7 +47,7 @@ class ObservationTerms:
         """Evaluate all terms into `raw` and `values`, then update `errors` by a control step.
 
         Robots of `begun` (N,) have new episodes. With `again`, `errors` repeat the measurement of the same step. Without
-        `begun`, `errors` only show the measurement that the step would give, and keep their state.
+        `begun`, `errors` show the measurement that the step would give, but keep their state.
 
         Raises:
             TermError: a term fails.

@@ -20,8 +20,8 @@ class Slice:
 
 
 class RandomPool:
-    """Uniform random numbers of N environments. All are drawn by two launches; drawn separately, each part would take two.
-    Parts reserve their columns while the task is built.
+    """Uniform random numbers of N environments. Two launches draw all of them. If each part drew its own numbers, each would
+    take two launches. Parts reserve their columns while the task is built.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:

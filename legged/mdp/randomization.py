@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 VARIANTS = 1024
-"""Model variants that worlds choose from, if masses, inertias or armatures change within steps. MuJoCo derives constants from
-these fields. That cannot be done within a step, so variants are drawn at the start, with their constants."""
+"""Number of model variants that worlds choose from, if masses, inertias or armatures change within steps. MuJoCo derives
+constants from these fields, which is impossible within a step. So variants are drawn at the start, with their constants."""
 
 
 class Randomization:
@@ -48,10 +48,10 @@ class Randomization:
         self.redrawn = tuple(again)
         """Fields with `when: reset` or `interval`, which change within steps."""
         self.chosen_fields = tuple(name for name in again if FIELDS[name].derived)
-        """Fields among `redrawn` from which MuJoCo derives constants. Worlds choose one variant of all of them together."""
+        """Fields among `redrawn` from which MuJoCo derives constants. A variant holds values of all these fields."""
         if again:
             self.steps = torch.zeros((), device=device)
-            """() control steps since training began, by which ranges grow."""
+            """() control steps since training began, which determine how far ranges have widened."""
             self.STATE = ("drawn", "steps")
 
     def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Distributions:
@@ -156,8 +156,8 @@ class Randomization:
             physics.prepare_redraws(self.drawn, known, self._of_model)
 
     def draw(self) -> None:
-        """Draw new values for every world. `redraw` applies them to the worlds that are due. Runs on a parallel stream of the
-        step.
+        """Draw new values for every world. `redraw` applies them to the worlds that are due. This runs on a parallel stream
+        of the step.
         """
         if not self.redrawn:
             return
@@ -210,11 +210,11 @@ class Randomization:
         self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the steps by which ranges have grown, for any number of worlds; empty if no range grows."""
+        """Return the number of steps for which ranges have widened, for any number of worlds; empty if no range widens."""
         return {"steps": self.steps.clone()} if any(draw.grow[1] > 0.0 for draw in self.draws.values()) else {}
 
     def load_progress(self, progress: Mapping[str, Tensor]) -> None:
-        """Continue from the growth that `progress` returned."""
+        """Continue from the number of steps that `progress` returned."""
         if "steps" in progress and self.redrawn:
             self.steps.copy_(progress["steps"])
 
@@ -228,8 +228,8 @@ class RobotRandomization(Randomization):
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Draw friction from `friction_buckets` values and the mass added to the base, even if they are switched off; then
-        draw from `cfg.ranges`, which replace both.
+        """Draw friction from `friction_buckets` values, and the mass added to the base, even if they are switched off. Then
+        draw the properties of `cfg.ranges`. If `cfg.ranges` names one of the first two, it takes precedence.
         """
         low, high = cfg.friction_range
         buckets = uniform(low, high, (cfg.friction_buckets,), device)

@@ -59,7 +59,7 @@ class Rewards:
         that is not finite counts as zero.
 
         Raises:
-            TermError: a term fails, or returns something else than (N,) or one number.
+            TermError: a term fails, or returns neither (N,) nor one number.
         """
         if not self.functions:
             return self.total
@@ -74,7 +74,7 @@ class Rewards:
                 if value.shape != (self.num_envs,):
                     raise ValueError(f"must return a tensor ({self.num_envs},), got {tuple(value.shape)}")
             values.append(value)
-        # Stacked, so that scaling, masking and summing cost one launch each instead of one per term.
+        # The values are stacked, so that scaling, masking and summing cost one launch each instead of one per term.
         stacked = torch.stack(values).float()
         if self._kernels is not None:
             rule = (self._factors, self._before_clip, valid, LARGEST, self.only_positive)

@@ -17,7 +17,7 @@ class TerrainCurriculum:
 
     The rule is legged_gym's. A robot that got further than half a tile from the middle of its tile moves up a level. A robot
     that got less than half as far as its command asked moves down. From the top level a robot goes to a random one.
-    Therefore a policy that is always promoted has a mean level of 6.0 over ten rows, not 9.
+    Therefore, with ten rows, a policy that is always promoted has a mean level of 6.0, not 9.
     """
 
     STATE = ("levels", "columns", "origins", "_sums")
@@ -58,7 +58,7 @@ class TerrainCurriculum:
         self._place()
 
     def draw(self) -> None:
-        """Draw a random level for every robot. Robots that finish the hardest level go there."""
+        """Draw a random level for every robot. A robot that finishes the hardest level moves to its random level."""
         self._random.random_(0, self.rows)
 
     def update(self, mask: Tensor, base_pos: Tensor, asked: Tensor) -> None:
@@ -82,7 +82,7 @@ class TerrainCurriculum:
         self._place()
 
     def place_at(self, levels: Tensor, columns: Tensor) -> None:
-        """Put the robots on the tiles at `levels` and `columns`, (N,) each, and disable the curriculum."""
+        """Assign the tiles at `levels` and `columns`, (N,) each, to the robots, and disable the curriculum."""
         self.enabled = False
         self.levels.copy_(levels)
         self.columns.copy_(columns)
@@ -113,7 +113,7 @@ class TerrainCurriculum:
 
     def load_progress(self, state: dict[str, Tensor]) -> None:
         """Continue from saved levels. With another number of robots, levels are drawn from the saved ones. Reset the robots
-        afterwards: until then they stand on their old tiles.
+        afterwards, because until then they stand on their old tiles.
         """
         saved = state["levels"].to(self.levels.device).clamp(max=self.rows - 1)
         if len(saved) != len(self.levels):

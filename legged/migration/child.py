@@ -1,7 +1,7 @@
 """Program that runs a fork's configuration and prints its live values, methods and terrain types as JSON.
 
-`reading.py` starts it as a child process. It imports nothing of this package. Modules that are not installed, and Isaac Gym
-in any case, are replaced by stand-ins: any use of a stand-in gives another one.
+`reading.py` starts it as a child process. It imports nothing of this package. Stand-ins replace modules that are not
+installed, and always Isaac Gym. Any use of a stand-in gives another stand-in.
 """
 
 import abc
@@ -32,19 +32,19 @@ LEARNER_SECTIONS = ("policy", "algorithm", "runner")
 REPLACED = ("isaacgym", "rsl_rl")
 """Modules with a stand-in even if they are installed."""
 ALONE = "file_of_the_user"
-"""Name of the package that a file outside any package belongs to."""
+"""Name of the package that is made for a file outside any package."""
 BUILT_IN = "legged_gym's"
 """Name of the module of the classes in `KNOWN`."""
 GAP = 2
 """Largest number of folders without __init__.py between a file and its package."""
 LONGEST = 100_000
-"""Largest length of a value or of an error's text, in characters."""
+"""Greatest length of a value or of an error's text, in characters."""
 OPERATORS = ["add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul", "and", "or", "xor", "lshift", "rshift"]
 INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
 READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
-"""Name -> pattern of the text of a method."""
+"""Name -> pattern that is searched for in the text of a method."""
 CUT = "(cut)"
-"""Name of some columns of joined parts."""
+"""Name for a selection of columns of joined parts."""
 CALLS: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 """Calls of stand-ins: name, and arguments."""
 KNOWN: dict[str, Any] = {}
@@ -114,14 +114,14 @@ class _Meta(abc.ABCMeta):
 
 
 class Base(metaclass=_Meta):
-    """Base class in place of one that is not installed."""
+    """Stand-in for a base class that is not installed."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__()
 
 
 class StandInModule(types.ModuleType):
-    """Module in place of one that is not installed."""
+    """Stand-in for a module that is not installed."""
 
     def __getattr__(self, name: str) -> Any:
         if name not in KNOWN:
@@ -132,7 +132,9 @@ class StandInModule(types.ModuleType):
 
 
 class Finder:
-    """Finder of stand-ins for modules that the user's files import. Installed packages get none for their optional parts."""
+    """Finder of stand-ins for modules that the user's files import. If an installed package imports an optional module, it
+    gets no stand-in.
+    """
 
     def __init__(self, only: tuple[str, ...] = (), own: str = "") -> None:
         self.only, self.own = only, own
@@ -177,7 +179,7 @@ def define(name: str, data: dict[str, Any], parent: Any) -> type:
 
 
 def load(file: Path) -> tuple[types.ModuleType, Path]:
-    """Import the file as a module of its package; return it and the folder of the package or, without one, of the file."""
+    """Import the file as a module of its package. Return the module, and the folder of the package or else of the file."""
     gap, root, own = 0, file.parent, ALONE
     for folder in file.parents:
         gap += 1
@@ -207,14 +209,16 @@ def objects() -> list[Any]:
 
 
 def fork_classes(attribute: str) -> list[type]:
-    """Return the user's classes with an attribute that begins so, without base classes of others."""
+    """Return the user's classes that have an attribute whose name begins with `attribute`. Base classes of others are left
+    out.
+    """
     classes = dict.fromkeys(value for value in objects() if isinstance(value, type) and _is_of_fork(value.__module__))
     having = [cls for cls in classes if any(name.startswith(attribute) for name in dir(cls))]
     return [cls for cls in having if not any(other is not cls and issubclass(other, cls) for other in having)]
 
 
 def registered() -> dict[str, tuple[Any, Any, Any]]:
-    """Return task -> class, configuration and learner's configuration, from all registries that were filled."""
+    """Return, for each task in any registry, its class, its configuration and its learner's configuration."""
     found: dict[str, tuple[Any, Any, Any]] = {}
     for value in objects():
         tables = [getattr(value, name, None) for name in ("task_classes", "env_cfgs", "train_cfgs")]
@@ -233,8 +237,8 @@ def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str,
 
 
 def configurations(module: types.ModuleType) -> dict[str, type]:
-    """Return the environment configurations that a module defines. A function `config_*` makes one of a class that its module
-    imports.
+    """Return the environment configurations that a module defines. A function `config_*` makes a configuration of a class
+    that its module imports.
     """
     learners = with_sections(module, LEARNER_SECTIONS)
     classes = {name: value for name, value in with_sections(module, SECTIONS).items() if name not in learners}
@@ -249,7 +253,7 @@ def configurations(module: types.ModuleType) -> dict[str, type]:
 
 
 def learner_of(module: types.ModuleType, name: str) -> Any:
-    """Return the learner's configuration that belongs to an environment's by its name, or the only one."""
+    """Return the learner's configuration whose name fits the environment's, or the only one."""
     learners = {k: v for k, v in with_sections(module, LEARNER_SECTIONS).items() if v.__module__ == module.__name__}
     for other in (f"{name}PPO", name.replace("Cfg", "CfgPPO"), name.replace("Config", "ConfigPPO")):
         if other in learners:
@@ -277,7 +281,7 @@ def nodes_of(file: str) -> dict[str, Any]:
 
 
 def place_of(owner: type, name: str) -> tuple[str, int]:
-    """Return file and line of an attribute of a class; the line of the class if the attribute was set elsewhere."""
+    """Return file and line of a class's attribute, or of the class if the attribute was set elsewhere."""
     file = getattr(sys.modules.get(owner.__module__), "__file__", None)
     if file is None:
         return f"legged_gym's {owner.__qualname__}", 0
@@ -293,7 +297,7 @@ def plain(value: Any) -> Any:
     """Return a value as JSON has it.
 
     Raises:
-        NotPlain: it has no such form; the text says why.
+        NotPlain: the value has no such form; the text says why.
     """
 
     def other(item: Any) -> Any:
@@ -315,8 +319,8 @@ def plain(value: Any) -> Any:
 
 
 def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:
-    """Return the settings of a configuration, a class or an instance, and of its sections: dotted path -> value, file, line,
-    reason why the value is unknown.
+    """Return the settings of a configuration (a class or an instance) and of its sections: dotted path -> value, file, line,
+    and the reason if the value is unknown.
     """
     found: dict[str, Any] = {}
     cls = owner if isinstance(owner, type) else type(owner)
@@ -338,8 +342,8 @@ def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict
 
 
 def method(function: Any) -> dict[str, Any]:
-    """Return place and digest of a method, and what matters of its text. Its layout and docstring do not count. Rewards in a
-    container class read `self.env` in place of `self`.
+    """Return place and digest of a method, and the names of `READS` that it reads. The digest does not depend on layout and
+    docstring. Rewards in a container class read `self.env` in place of `self`.
     """
     code = inspect.unwrap(function).__code__
     node = nodes_of(code.co_filename).get(code.co_qualname, ast.parse(""))
@@ -351,7 +355,7 @@ def method(function: Any) -> dict[str, Any]:
 
 
 def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str, Any]]]:
-    """Return name -> methods of the classes: rewards, and those of the given names."""
+    """Return name -> methods of the classes: rewards, and the methods that `names` lists."""
     found: dict[str, list[dict[str, Any]]] = {}
     for cls in classes:
         for name in dir(cls):
@@ -362,7 +366,9 @@ def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str
 
 
 def environment_classes(task_class: Any, root: Path) -> list[type]:
-    """Return the class of the task; if no registry names it, all classes with rewards in the package or next to the file."""
+    """Return the class of the task. If no registry names one, return all classes with rewards in the package or next to the
+    file.
+    """
     if isinstance(task_class, type):
         return [task_class]
     for file in sorted(root.glob("*.py" if ALONE in sys.modules else "**/*.py"))[:1000]:
@@ -376,7 +382,9 @@ def environment_classes(task_class: Any, root: Path) -> list[type]:
 
 
 def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> None:
-    """Run a function with the arguments `values` by their names, stand-ins for its other arguments, and other globals."""
+    """Run a function with `values` for the arguments of those names, stand-ins for all other arguments, and `others` in place
+    of its globals.
+    """
     run = types.FunctionType(function.__code__, function.__globals__ | others, None, None, function.__closure__)
     CALLS.clear()
     run(*(values.get(name, StandIn(name)) for name in inspect.signature(function).parameters))
@@ -410,14 +418,14 @@ def terrains(config: Any) -> list[Any] | None:
 
 
 def sign(args: tuple[Any, ...], options: dict[str, Any]) -> int:
-    """Return the sign of a terrain function's slope or height of steps; 0 without one."""
+    """Return the sign of a terrain function's slope or step height; 0 if it has neither."""
     value = options.get("slope", options.get("step_height", args[1] if len(args) > 1 else 0))
     return (value > 0) - (value < 0) if isinstance(value, int | float) else 0
 
 
 def observations(cls: type, config: Any) -> list[Any]:
     """Return the parts that compute_observations joins for the policy and for the value function, each as the names and
-    numbers that it is computed from; None if they can't be told.
+    numbers that it is computed from. A list is None if its parts can't be determined.
     """
     self = StandIn("self")
     vars(self).update(cfg=config)
@@ -469,7 +477,7 @@ def snake(name: str) -> str:
 
 
 def failure(error: BaseException) -> dict[str, Any]:
-    """Return the answer for code that raised an error: its text, and the last place in the user's files."""
+    """Return the answer for code that raised an error: the error's text, and the last place in the user's files."""
     places = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
     own = [(file, line) for file, line in places if file != __file__ and not _is_installed(file)]
     if isinstance(error, SyntaxError) and error.filename:
@@ -479,7 +487,7 @@ def failure(error: BaseException) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer the request on standard input; what the user's code prints goes to standard error."""
+    """Answer the request on standard input. Output of the user's code goes to standard error."""
     out = os.dup(1)
     os.dup2(2, 1)
     request = json.loads(sys.stdin.buffer.read())
@@ -491,7 +499,7 @@ def main() -> None:
     with os.fdopen(out, "w") as stream:
         json.dump(result, stream)
     sys.stderr.flush()
-    os._exit(0)  # threads of the user's code would keep the process
+    os._exit(0)  # threads of the user's code would keep the process alive
 
 
 if __name__ == "__main__":

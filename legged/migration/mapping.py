@@ -17,7 +17,7 @@ from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
 
 LONGEST_HISTORY = 20
-"""Largest number of steps of an observation history that is tried."""
+"""Longest observation history that is tried [steps]."""
 SIGMA = "tracking_sigma"
 OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 """Methods of legged_gym that use commands[:, 3], the heading."""
@@ -46,7 +46,7 @@ def map_settings(fork: Fork) -> Translation:
 
 
 def _moved(settings: dict[str, Found]) -> dict[str, Found]:
-    """Return the settings by legged_gym's paths."""
+    """Return the settings with their paths changed to legged_gym's."""
     paths = {}
     for path in settings:
         start = next((old for old in tables.MOVED if path == old or (old.endswith(".") and path.startswith(old))), "")
@@ -101,7 +101,7 @@ def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, 
 
 
 def _fits(result: Translation, name: str) -> bool:
-    """Return True if a type fits on the file's tiles; if not even level ground fits, take the default sizes."""
+    """Return True if a terrain type fits on the file's tiles. If no type could fit, take the default tile sizes."""
     sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
     try:
         check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
@@ -115,7 +115,7 @@ def _fits(result: Translation, name: str) -> bool:
 
 
 def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[dict[str, float], list[str]]:
-    """Return shares rounded to whole columns, at least one each, and the types that have less than one and are left out."""
+    """Return shares rounded to whole columns, and the types that are left out because their share is less than a column."""
     columns, out = int(result.settings.get("terrain.num_cols", DEFAULTS["terrain"]["num_cols"])), []
     while len(shares) > 1 and min(shares.values()) * columns < 1.0 - 1e-9:
         name = min(shares, key=lambda key: shares[key])
@@ -163,7 +163,9 @@ def _contacts(result: Translation) -> None:
 
 
 def _rewards(result: Translation, fork: Fork) -> None:
-    """Map the scales of rewards with legged_gym's formula; name the methods of the others, which have no scale here."""
+    """Map the scales of rewards that have legged_gym's formula. For all other rewards, name the methods to paste; they get no
+    scale.
+    """
     known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
     sigma, mapped, paste = "", set(), []
     for path in [path for path in result.theirs if path.startswith(prefix)]:
@@ -199,7 +201,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
 
 
 def _observations(result: Translation, fork: Fork) -> None:
-    """Map the observations: by what compute_observations joins or, without a class, by their number."""
+    """Map the observations by the parts that compute_observations joins or, without a class, by their number."""
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
     history, one = (result.get(result.has(*names) or names[0]) for names in (tables.HISTORY, tables.ONE_STEP))
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
@@ -230,7 +232,7 @@ def _observations(result: Translation, fork: Fork) -> None:
 
 
 def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
-    """Return the terms here of the parts of an observation; add the names of other parts to `own`."""
+    """Return the terms of this package for the parts of an observation. Add the names of parts without a term to `own`."""
     terms = []
     for names in parts:
         used = {name for name in names if "scale" not in name}
@@ -313,7 +315,7 @@ def _delay(result: Translation) -> None:
 
 
 def _hooks(result: Translation, fork: Fork) -> None:
-    """Name the fork's own methods whose content no setting carries over, and the commands with another meaning."""
+    """Name the fork's methods that no setting replaces, and the commands that have another meaning."""
     own = {name: method for name, methods in fork.methods.items() for method in methods if not method.original}
     hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:

@@ -1,7 +1,7 @@
 """Reading of a fork's configuration: `child.py` runs it in another process, and this module takes what it prints.
 
 `legged_gym.yaml` has legged_gym's classes (`known`: name, base class, values), so that files that extend them run without it;
-rsl_rl's defaults; and digests of legged_gym's methods, since names alone say nothing of a fork's formulas.
+rsl_rl's defaults; and digests of legged_gym's methods, because a fork may change a formula but keep its name.
 """
 
 import json
@@ -62,7 +62,8 @@ class Fork:
     settings: dict[str, Found]
     """Settings of the environment and of the learner, by dotted path."""
     methods: dict[str, list[Method]]
-    """Rewards and hooks by name; several if the class of the task is not known. Empty if no class was found."""
+    """Rewards and hooks by name. A name has several methods if the class of the task is not known. Empty if no class was
+    found."""
     observations: list[Any]
     """Parts of the policy's and of the value function's observations (`child.observations`)."""
     terrains: list[Any] | None
@@ -74,7 +75,7 @@ def read_fork(path: Path, asked: str | None) -> Fork:
     the new task.
 
     Raises:
-        ConfigError: the file fails, or has no configuration, or several and `asked` chooses none of them.
+        ConfigError: the file fails, has no configuration, or has several of which `asked` chooses none.
     """
     data = run_child(path, asked)
     if "error" in data:
@@ -85,7 +86,7 @@ def read_fork(path: Path, asked: str | None) -> Fork:
     settings = {path: Found(value, _place(*where), why) for path, (value, *where, why) in data["settings"].items()}
     for section, values in ORIGINAL["rsl_rl"].items():
         named = [found.place for name, found in settings.items() if name.startswith(f"{section}.")]
-        if named:  # a section without base class leaves missing settings to rsl_rl
+        if named:  # without a base class, rsl_rl's defaults apply
             missing = {f"{section}.{name}": Found(value, f"rsl_rl's default; {named[0]}") for name, value in values.items()}
             settings = missing | settings
     built_in = f"; {', '.join(sorted(data['built_in']))} as legged_gym v1.0.2 has them" if data["built_in"] else ""
@@ -108,7 +109,7 @@ def run_child(path: Path, asked: str | None) -> dict[str, Any]:
     with tempfile.TemporaryFile() as output:
         try:
             done = subprocess.run(
-                [sys.executable, "-P", str(CHILD)],  # without the child's folder among the modules
+                [sys.executable, "-P", str(CHILD)],  # -P keeps the child's folder off the search path
                 input=json.dumps(request).encode(),
                 stdout=subprocess.PIPE,
                 stderr=output,

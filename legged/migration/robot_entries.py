@@ -23,20 +23,22 @@ LISTS = (
 
 
 def asset_of(result: Translation) -> str:
-    """Return the path of the robot's file in a configuration, without the fork's folder in braces."""
+    """Return the path of the robot's file in a configuration, without the name of the fork's folder, which is in braces."""
     return re.sub(r"^\{\w+\}/*", "", str(result.get("asset.file", "") or ""))
 
 
 def names_of(result: Translation) -> list[str]:
-    """Return possible names of the robot here: the actor's name, the file's, and the folder's above the file."""
+    """Return possible names of the robot in this package: the actor's name, the file's name, and the name of the file's
+    parent folder.
+    """
     path = Path(asset_of(result))
     folders = [part for part in path.parts[:-1] if part not in ("resources", "robots", "urdf", "xml", "mjcf", "..", ".", "/")]
     return [name for name in (str(result.get("asset.name", "")), path.stem, *folders[::-1]) if name]
 
 
 def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
-    """Set the task's gains, and return entries of robot.yaml: those that differ from the entries of `robot`, or all without
-    one.
+    """Set the task's gains, and return entries of robot.yaml: those that differ from the entries of `robot`, or all if
+    `robot` is None.
     """
     gains = {name: result.get(f"control.{name}", {}) for name in ("stiffness", "damping")}
     if result.get("control.use_actuator_network", False) or result.get("control.control_type") == "actuator_net":
@@ -80,14 +82,16 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
 
 
 def _patterns(result: Translation, path: str) -> list[str]:
-    """Return a list of name patterns; a fork may give a single one as text."""
+    """Return a list of name patterns. A fork may give a single pattern as text."""
     value = result.get(path)
     names = value if isinstance(value, list) else [value] if isinstance(value, str) else []
     return [str(name) for name in names if name and name != "None"]
 
 
 def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]) -> None:
-    """Set the task's gains where they differ from the robot's. In legged_gym the last pattern in a joint's name counts."""
+    """Set the task's gains where they differ from the robot's. If several patterns are part of a joint's name, the last one
+    counts, as in legged_gym.
+    """
     path, own = f"control.{name}", getattr(robot, name)
     for pattern in [key for key in table if not any(key in joint for joint in robot.joint_names)]:
         del table[pattern]
@@ -109,7 +113,7 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
 def _contacts(
     result: Translation, theirs: str, patterns: list[str], shapes: Shapes, robot: str
 ) -> tuple[list[str], set[int]]:
-    """Return the patterns of a list that name shapes or bodies of the robot, and the contacts that they name."""
+    """Return those patterns of a list that match shapes or bodies of the robot, and the indices of the matched shapes."""
     found: set[int] = set()
     kept: list[str] = []
     for pattern in patterns:

@@ -1,8 +1,10 @@
-"""Tables of legged_gym's settings, and of its forks', and of the settings here."""
+"""Tables that map settings of legged_gym and its forks to settings of this package."""
 
 
 def _pairs(text: str) -> dict[str, str]:
-    """Return setting -> setting here. A line has a section, the section here, and names; theirs=ours where they differ."""
+    """Return setting -> setting here. A line has a fork's section, the section of this package, and names, as theirs=ours
+    where they differ.
+    """
     pairs: dict[str, str] = {}
     for line in text.strip().splitlines():
         sections, _, names = line.partition(": ")
@@ -43,12 +45,13 @@ algorithm -> train.algorithm: value_loss_coef use_clipped_value_loss clip_param 
 algorithm -> train.algorithm: num_learning_epochs num_mini_batches learning_rate schedule max_grad_norm
 runner -> train.runner: num_steps_per_env max_iterations save_interval experiment_name run_name
 """)
-"""Setting of a fork -> setting here of the same meaning."""
+"""Setting of a fork -> setting of this package with the same meaning."""
 OF_TERRAIN = _pairs("""
 terrain -> terrain: horizontal_scale border_size curriculum max_init_terrain_level
 terrain -> terrain: terrain_length terrain_width num_rows num_cols
 """)
-"""More such settings, for ground that is not a plane; then those of measured heights, and of recurrent policies."""
+"""More settings with the same meaning, for ground that is not a plane. `OF_HEIGHTS` is for measured heights, `OF_RECURRENT`
+for recurrent policies."""
 OF_HEIGHTS = _pairs("terrain -> terrain: measured_points_x measured_points_y")
 OF_RECURRENT = _pairs("policy -> train.policy: rnn_type rnn_hidden_size=rnn_hidden_dim rnn_num_layers")
 ABSENT = {
@@ -57,7 +60,8 @@ ABSENT = {
     **{f"commands.ranges.{name}": [0.0, 0.0] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")},
     **{f"noise.noise_scales.{name}": 0.0 for name in ("gravity", "lin_vel", "ang_vel", "dof_pos", "dof_vel")},
 }
-"""Setting -> value that it has here if a fork has no such setting. The defaults here would add what the fork does not do."""
+"""Setting of this package -> value if a fork lacks such a setting. The default would add something that the fork does not
+do."""
 RANDOM_MODEL = {
     "link_mass": "link_mass",
     "restitution": "restitution",
@@ -69,9 +73,8 @@ RANDOM_MODEL = {
     "joint_friction": "joint_friction",
     "init_state.dof_pos_factor": "initial_joint_pos",
 }
-"""Properties or settings here -> names of forks: randomize_<name> switches on <name>_range or randomize_<name>_range. After a
-colon stands the range's name, if it is another.
-"""
+"""Property or setting of this package -> names in forks. There randomize_<name> switches on <name>_range or
+randomize_<name>_range. If the range has another name, it follows after a colon."""
 HISTORY = (
     *("env.frame_stack", "env.obs_history_length", "env.num_observation_history"),
     *("env.history_len", "env.include_history_steps"),
@@ -117,14 +120,14 @@ NEAR = {
     r"sim\.substeps": "sim.dt is the step of the physics",
     r"runner\.(policy|algorithm)_class_name|runner_class_name": "networks and learner are those of train",
 }
-"""Pattern of a fork's setting -> the nearest setting here, or why no setting here is near."""
+"""Pattern of a fork's setting -> the nearest setting of this package, or the reason why no setting is near."""
 MINOR = (
     r"viewer\.|sim\.physx\.|sim\.(up_axis|use_gpu_pipeline|no_camera)|env\.(env_spacing|send_timeouts|num_actions|debug_viz)"
     r"|env\.record|env\.num_recording|terrain\.(vertical_scale|slope_tres?hold|dynamic_friction|simplify_grid|hf2mesh_method)"
     r"|asset\.(replace_cylinder|flip_visual|density|default_dof_drive|angular_damping|linear_damping|max_angular|max_linear"
     r"|thickness)|runner\.(resume|load_run|checkpoint|log_interval)|commands\.num_bins|depth\.|play\."
 )
-"""Settings of Isaac Gym, of drawing, and of the command line, which change no task here."""
+"""Settings of Isaac Gym, of drawing, and of the command line. They change no task of this package."""
 
 OF_THE_ROBOT = (
     r"init_state\.(pos|rot|default_joint_angles)$|control\.(stiffness|damping|actuator_net_file)"

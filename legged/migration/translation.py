@@ -15,18 +15,18 @@ from legged.migration.reading import Found
 
 DEFAULTS = to_dict(LeggedConfig())
 LIKE_DEFAULTS = {"commands.ranges.heading": [-3.14, 3.14], "train.runner.experiment_name": "test"}
-"""Path here -> value that legged_gym has in place of the default here."""
+"""Path in this package -> default of legged_gym, which counts as equal to the default of this package."""
 
 
 @dataclass(frozen=True)
 class Lost:
-    """A setting that has no counterpart here, or another meaning."""
+    """Setting of a fork that has no counterpart in this package, or whose counterpart has another meaning."""
 
     place: str
     setting: str
     value: str
     reason: str
-    """Empty if no setting here is near."""
+    """Reason, or the nearest setting of this package; empty if no setting is near."""
 
     def __str__(self) -> str:
         value = f" = {self.value}" if self.value else ""
@@ -52,8 +52,8 @@ class Translation:
     """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return a value of the file; `default` if it is not set or unknown. With a default that is a float, a list or a
-        table, it must be a number, a list of numbers, or a table of names and numbers; another value is recorded as lost.
+        """Return a value of the file; `default` if it is not set or unknown. If the default is a float, a list or a table,
+        the value must be a number, a list of numbers, or a table of names and numbers. Any other value is recorded as lost.
         """
         self.done.add(path)
         found, kind, fits = self.theirs.get(path), "", True
@@ -85,7 +85,7 @@ class Translation:
             self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path` here, unless the value is the default; a value that the schema refuses is recorded as lost."""
+        """Set `path`, unless the value is the default. A value that the schema refuses is recorded as lost."""
         self.done.add(theirs)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")
@@ -99,7 +99,7 @@ class Translation:
         if value in (default, LIKE_DEFAULTS.get(path, default)):
             self.settings.pop(path, None)  # remove the value from another setting of the file
             return
-        self.settings[path] = copy.deepcopy(value)  # YAML marks a list that is there twice
+        self.settings[path] = copy.deepcopy(value)  # YAML would write a repeated list as an alias
         if comment:
             self.comments[path] = comment
 
@@ -118,5 +118,5 @@ class Translation:
 
 
 def is_number(value: Any) -> bool:
-    """Return True if a value is a number of plausible size, and not a bool."""
+    """Return True if a value is a number of plausible size. A bool is not a number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e12

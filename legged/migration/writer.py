@@ -30,12 +30,12 @@ def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mappin
 
 
 def robot_yaml(head: Sequence[str], entries: Mapping[str, Any]) -> str:
-    """Return a robot.yaml with the lines of a head."""
+    """Return the text of a robot.yaml that begins with the lines of `head`."""
     return _comments(head) + "".join(_text(key, value) for key, value in entries.items())
 
 
 def _text(key: str, value: Any) -> str:
-    """Return an entry as YAML; a value that is no mapping is on one line."""
+    """Return an entry as YAML. A value that is not a mapping is written on one line."""
     if isinstance(value, dict):
         return dump({key: value}, default_flow_style=None, width=WIDTH, sort_keys=False)
     return f"{key}: {dump(value, default_flow_style=True, width=10**9)}".removesuffix("...\n")

@@ -20,7 +20,7 @@ from legged.process.paths import data_folder, exists, relative
 from legged.registry import YAML_ENDINGS, register_file, task_class, task_config, task_names
 
 OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_name", "train.runner.stop_at")
-"""Settings that the sweep sets itself."""
+"""Settings that a sweep sets itself, so that its file must not."""
 EVALUATIONS = 10
 """Default number of evaluations of a trial."""
 NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
@@ -45,11 +45,10 @@ class ObjectiveConfig:
     """The objective of a sweep."""
 
     figure: str = ""
-    """Figure of the evaluations during training; the most important one when empty."""
+    """Figure of the evaluations during training; empty for the most important one."""
     take: Literal["last", "best", "time", "steps"] = "last"
-    """Value of a trial: the last or the best value of the figure, or the training time [s] or the steps of all robots until
-    it reaches `target`.
-    """
+    """Value of a trial: the figure's last or best value, or the training time [s] or the steps of all robots until the figure
+    reaches `target`."""
     target: float | None = field(default=None, metadata=NUMBER)
     """Value of the figure at which a trial ends."""
 
@@ -63,7 +62,7 @@ class SweepConfig:
     name: str = field(default="", metadata=NAME)
     """Folder under logs/; by default sweep_ and the name of the file."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
-    """Trials in all, of all processes."""
+    """Number of trials of all processes together."""
     seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
     """Seeds of each trial. The value of a trial is the mean over its seeds."""
     objective: ObjectiveConfig = ObjectiveConfig()
@@ -88,7 +87,7 @@ class Parameter:
 
     path: str
     distribution: Any
-    """Optuna's distribution of whole numbers, of numbers, or of choices as JSON."""
+    """Optuna's distribution: of whole numbers, of real numbers, or of choices as JSON texts."""
 
     def value(self, drawn: Any) -> Any:
         """Return the value of the setting from a drawn number, rounded to four digits, or from the text of a choice."""
@@ -153,8 +152,8 @@ class Plan:
 
     @property
     def negated(self) -> bool:
-        """True if intermediate figures are negated when they are reported: the values of trials are times, where less is
-        better, but more of the figure is better.
+        """True if intermediate figures are negated when they are reported. This is the case if trials' values are times, of
+        which less is better, while of the figure more is better.
         """
         return self.until_target and not lower_is_better(self.figure)
 
@@ -170,15 +169,15 @@ class Plan:
 
     @property
     def identity(self) -> str:
-        """Text of all parts that must stay the same for trials to be comparable."""
+        """Text of all parts of the sweep that must stay the same, so that trials can be compared."""
         given = to_dict(self.given)
         return json.dumps(
             {name: given[name] for name in ("task", "seeds", "objective", "overrides", "parameters")}, sort_keys=True
         )
 
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
-        """Return the arguments of `legged train` for a trial of that number: with evaluations that make trials comparable,
-        and with neither report nor film, which would take longer than many trials; `legged runs report` makes them later.
+        """Return the arguments of `legged train` for trial `number`. They include evaluations, by which trials are compared.
+        They exclude report and film, because these take longer than many trials; `legged runs report` makes them later.
         """
         runner, target = self.cfg.train.runner, self.given.objective.target
         settings = {
@@ -215,8 +214,8 @@ def sweep_file(text: str) -> Path:
 
 
 def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
-    """Read the file of a sweep, check it against its task, and return the plan. `trials` takes the place of their number in
-    the file.
+    """Read the file of a sweep, check it against its task, and return the plan. `trials`, if given, replaces the number of
+    trials in the file.
 
     Raises:
         ConfigError: Optuna is missing, a setting is unknown, a value is out of bounds, or the objective is not measured.
@@ -259,7 +258,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
 
 
 def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> Parameter:
-    """Return the swept setting; the ends of its range and all its choices must be valid values."""
+    """Return the swept setting. Both ends of its range, or all its choices, must be valid values."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
     where = f"{path}: parameters: {key}"
@@ -294,7 +293,7 @@ def _try(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
 
 @contextmanager
 def _said_in(path: Path, section: str) -> Iterator[None]:
-    """Make errors about settings name the file of the sweep in place of 'command line' or 'TASK'."""
+    """Make errors in the block name the sweep's file instead of 'command line' or 'TASK'."""
     try:
         yield
     except ConfigError as error:

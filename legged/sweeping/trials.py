@@ -33,7 +33,7 @@ JOURNAL = "journal:"
 BEAT_S = 10.0
 """Interval at which a process confirms that it works on its trial [s]."""
 GRACE_S = 120.0
-"""A process on another machine without a confirmation for this long is dead [s]."""
+"""A process on another machine counts as dead if it has not confirmed its work for this long [s]."""
 WAIT_S = 60
 """Longest wait for the lock of an SQLite file [s]."""
 FEWEST = 4
@@ -43,18 +43,18 @@ MOST_TRIES = 5
 OWNER, ALIVE, TRIES, WHY, RUNS = "owner", "alive", "tries", "why", "runs"
 """Attributes of a trial."""
 SWEEP, DEVICE = "sweep", "device"
-"""Attributes of the study: the parts of the sweep that must stay the same, and the kind of device, cpu or cuda."""
+"""Attributes of the study: the parts of the sweep that must stay the same, and the kind of device (cpu or cuda)."""
 
 
 class Trials:
     """The study of a sweep, shared by all processes that take part."""
 
     def __init__(self, plan: Plan, asked: str = "", worker: int = 0) -> None:
-        """Open the storage `asked`, else that of the plan, else sweep.db in the sweep's folder.
+        """Open the storage `asked`; if it is empty, the plan's storage; if that is empty too, sweep.db in the sweep's folder.
 
         Raises:
-            ConfigError: it holds another sweep of the same name, or its name is invalid.
-            RunError: it can't be reached.
+            ConfigError: the storage holds another sweep of the same name, or the storage's name is invalid.
+            RunError: the storage can't be reached.
         """
         import optuna
 
@@ -108,8 +108,8 @@ class Trials:
         return len(finished(self.all))
 
     def next(self) -> "Trial | None":
-        """Begin the next trial, a repeated or a new one; return None if there are enough. Processes that call this at the
-        same time do not begin more trials than planned.
+        """Begin the next trial, a repeated or a new one. Return None if there are enough trials. Processes that call this at
+        the same time do not begin more trials than planned.
         """
         self.take_back()
         wanted = self.plan.given.trials
@@ -137,7 +137,9 @@ class Trials:
         self.study.tell(trial, state=self._optuna.trial.TrialState[state])
 
     def take_back(self) -> list[int]:
-        """Queue the trials of dead processes again; return their numbers. Of several processes, one does so."""
+        """Queue the trials of dead processes again, and return the trials' numbers. If several processes call this, only one
+        queues a trial.
+        """
         taken = []
         for trial in self._running():
             begun = trial.datetime_start.timestamp() if trial.datetime_start is not None else None
@@ -147,8 +149,8 @@ class Trials:
         return taken
 
     def try_again(self, trial: "Trial | FrozenTrial", why: str) -> bool:
-        """End a trial without a value, and queue its settings again unless it had too many attempts. Return False if another
-        process ended it.
+        """End a trial without a value, and queue its settings again unless they had too many attempts. Return False if
+        another process has ended the trial.
         """
         tries = int(trial.user_attrs.get(TRIES, 1))
         last = tries >= MOST_TRIES
@@ -157,7 +159,7 @@ class Trials:
         try:
             if not self._storage.set_trial_state_values(trial._trial_id, state):
                 return False
-        except (RuntimeError, self._optuna.exceptions.OptunaError):  # another process ended it
+        except (RuntimeError, self._optuna.exceptions.OptunaError):  # another process has ended the trial
             return False
         if not last and trial.params:
             self.study.enqueue_trial(trial.params, user_attrs={TRIES: tries + 1})
@@ -170,7 +172,7 @@ class Trials:
         """Return a context in which this process confirms at intervals that it works on a trial."""
 
         def beat() -> None:
-            with suppress(Exception):  # the storage may be away for a moment
+            with suppress(Exception):  # the storage may be unreachable for a moment
                 self._storage.set_trial_user_attr(trial._trial_id, ALIVE, time.time())
 
         return repeating(beat, BEAT_S)
@@ -227,8 +229,8 @@ def me() -> str:
 
 
 def is_dead(owner: str | None, said: float | None) -> bool:
-    """Return whether the process of a trial has died: on this machine, if it does not exist; elsewhere, if its last
-    confirmation `said` (seconds since 1970) is too old.
+    """Return True if the process of a trial has died. A process of this machine has died if it does not exist; one of another
+    machine, if its last confirmation `said` [s since 1970] is too old.
     """
     parts = (owner or "").rsplit(" ", 2)
     if len(parts) == 3 and parts[0] == _machine() and parts[1].isdecimal():
@@ -237,7 +239,7 @@ def is_dead(owner: str | None, said: float | None) -> bool:
 
 
 def _machine() -> str:
-    """Return an identifier of this machine, or container, that changes when it restarts."""
+    """Return an identifier of this machine or container. It changes at a restart."""
     words = [socket.gethostname()]
     with suppress(OSError):
         words.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
@@ -319,7 +321,7 @@ def own_trial(plan: Plan, trials: Sequence["FrozenTrial"]) -> "FrozenTrial | Non
 
 
 def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None) -> str:
-    """Return all trials as Markdown: those with a value by rank, then those that were ended early, then the others."""
+    """Return all trials as Markdown: those with a value by rank, then those that were ended early, then all other trials."""
     order = {"PRUNED": 0, "RUNNING": 1, "WAITING": 2, "FAIL": 3}
     ranked = ranking(plan, trials)
     others = sorted((t for t in trials if t.state.name != "COMPLETE"), key=lambda t: (order[t.state.name], t.number))
@@ -379,8 +381,8 @@ def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
 def draw_figures(trials: Trials) -> list[Path]:
     """Draw Optuna's figures of the trials: values over trials, values over settings, and the importance of settings for a
     trial to be among the best (PED-ANOVA, Watanabe et al., arXiv 2304.10255). Importance is left out while there are too few
-    trials, and while the best quarter is no better than the rest: all settings would have the same. Return the paths of the
-    files.
+    trials, and while the best quarter is no better than the rest, because all settings would then be equally important.
+    Return the paths of the files.
 
     Raises:
         RunError: a file can't be written.

@@ -128,7 +128,7 @@ def test_a_quantity_that_there_is_not_is_refused():
 
 
 def test_a_term_ends_episodes_in_one_way_only():
-    with pytest.raises(ConfigError, match=r"terminations\.time_outs: 'contact' is a failure already"):
+    with pytest.raises(ConfigError, match=r"terminations\.time_outs: 'contact' is also in terminations\.failures"):
         small_config(("terminations.time_outs", ["contact"]))
 
 

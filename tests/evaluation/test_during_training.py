@@ -162,7 +162,7 @@ def test_a_recurrent_policy_begins_each_evaluation_without_memory():
             "stop_at.velocity: evaluations of 'anymal_c_flat' find no 'velocity'",
         ),
         ([("train.runner.best_by", "lin_rmse")], "best_by: .* find no 'lin_rmse'; did you mean 'lin_vel_rmse'"),
-        ([("train.runner.stop_at", {"falls": 0.1})], "stop_at: nothing is evaluated .* train.runner.evaluate_interval=50"),
+        ([("train.runner.stop_at", {"falls": 0.1})], "stop_at: needs evaluations .* set train.runner.evaluate_interval"),
     ],
 )
 def test_what_evaluations_do_not_find_is_refused(changes, words):
