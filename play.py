@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.cli.play import main
+from legged.cli.play import play
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(play.main())

@@ -2,7 +2,7 @@
 
 import sys
 
-from legged.cli.train import main
+from legged.cli.train import train
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(train.main())

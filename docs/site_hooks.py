@@ -19,7 +19,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from legged.cli.listing import robots, tasks
+from legged.cli.list import robots, tasks
 from legged.cli.main import COMMANDS, load
 from legged.config.reference import FieldText, fields
 from legged.config.schema import LeggedConfig

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.registry import make_task, task_config

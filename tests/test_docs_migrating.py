@@ -12,7 +12,7 @@ from test_docs_tasks import fenced, named
 
 from legged import math as legged_math
 from legged import registry, user_modules
-from legged.cli import train
+from legged.cli.train import train
 from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
 from legged.envs import LeggedRobot

@@ -9,8 +9,9 @@ import pytest
 from helpers import call, forget_modules_of
 
 from legged import registry, user_modules
-from legged.cli import play, train
 from legged.cli.evaluate import episodes
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.physics import FIELDS
 
 ROOT = Path(__file__).resolve().parents[1]

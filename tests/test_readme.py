@@ -14,9 +14,10 @@ import torch
 from helpers import POLICY
 
 from legged import registry
-from legged.cli import play, train
 from legged.cli.evaluate import grid, terrain
 from legged.cli.main import COMMANDS, load, split
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.deploy import __main__ as program
 from legged.process.command_parser import CommandParser
 from legged.registry import import_tasks, make_task, task_config

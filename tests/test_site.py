@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlparse
 import pytest
 import yaml
 
-from legged.cli.listing import robots, tasks
+from legged.cli.list import robots, tasks
 from legged.cli.main import COMMANDS, load
 from legged.config.reference import fields
 from legged.config.schema import LeggedConfig

@@ -17,7 +17,7 @@ from legged.commandline.command import run_main
 from legged.errors import ConfigError
 from legged.play.films import Film, film, walker, write_film
 from legged.policies.restore import TrainedPolicy, policy_of
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import IMPORT, CommandParser
 from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
 from legged.rendering.camera import INK
@@ -45,7 +45,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--out", type=Path, required=True, help="the file, .gif or .png")
     parser.add_argument("--columns", type=int, help="tiles in a row; by default the sheet is about twice as wide as high")
     parser.add_argument("--side", type=int, default=SIDE, help=f"width and height of a tile [pixels]; {SIDE}")
-    add_import_argument(parser)
+    IMPORT(parser)
     return parser
 
 

@@ -20,7 +20,7 @@ from evaluated_run import EvaluatedRun, find_runs, results_in, why_unfinished
 from run_table import markdown, summary
 from shipping import ship
 
-from legged.cli.evaluate.common import ROBOTS, check_points
+from legged.cli.evaluate import ROBOTS, check_points
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main, stopping_on_signals
 from legged.config import LeggedConfig, override, parse_override
@@ -31,7 +31,7 @@ from legged.evaluation.success import TYPES_HELP, chosen_sizes
 from legged.evaluation.velocity_grid import AXES, axes_of
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, experiment_folder, find_checkpoint, run_config
 from legged.learning.timing import read_timing
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import IMPORT, CommandParser
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.process.processes import Job, Kind, WorkerPool, why_failed
@@ -69,7 +69,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("--full", action="store_true", help="all sizes of a terrain type, 256 robots each")
     parser.add_argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full")
     parser.add_argument("--again", action="store_true", help="train finished runs again")
-    add_import_argument(parser)
+    IMPORT(parser)
     parser.add_argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one")
     parser.add_argument("--out", type=Path, help=f"folder for the table and the output of the processes; {OUT} by default")
     parser.add_argument("--ship", type=Path, help="folder to copy the policies to, e.g. resources/policies")

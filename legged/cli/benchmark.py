@@ -20,12 +20,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
+from legged.commandline.arguments import TASK, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY, sub_command
 from legged.config import LeggedConfig, TaskConfig, override
 from legged.config.networks import learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
+from legged.evaluation.result_file import write_result
 from legged.graph.step_graph import StepGraph
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint
@@ -36,8 +37,8 @@ from legged.learning.teacher import Teacher, find_teacher, with_teacher
 from legged.physics import resolve_physics
 from legged.policies.actor import Actor
 from legged.policies.restore import policy_of
-from legged.process.command_parser import CommandParser
-from legged.process.paths import make_folder, ready_to_write, relative, write_text
+from legged.process.command_parser import argument, check_number
+from legged.process.paths import ready_to_write, relative
 from legged.process.startup import STAGES_FILE
 from legged.registry import make_task, task_config
 
@@ -72,25 +73,24 @@ LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": Captured
 """Training loops by name."""
 
 
-def _add_arguments(parser: CommandParser) -> None:
-    add_task_arguments(parser)
-    parser.add_argument(
-        "--repeats", type=int, default=5, help="number of measurements; the result is their median; 5 by default"
-    )
-    parser.add_argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written")
-
-
-def _add_steps(parser: CommandParser) -> None:
-    _add_arguments(parser)
-    parser.add_argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default")
-
-
-def _add_step_arguments(parser: CommandParser) -> None:
-    """Add the options that choose the timed steps and iterations."""
-    _add_steps(parser)
-    parser.add_argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none")
-    parser.add_argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)")
-    parser.add_argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it")
+MEASURED = (
+    *TASK,
+    argument("--repeats", type=int, default=5, help="number of measurements; the result is their median; 5 by default"),
+    argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written"),
+)
+"""Arguments of all benchmarks."""
+STEPS = (
+    *MEASURED,
+    argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default"),
+)
+"""Arguments of benchmarks of control steps."""
+ITERATIONS = (
+    *STEPS,
+    argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none"),
+    argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)"),
+    argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it"),
+)
+"""Arguments of benchmarks of control steps and iterations."""
 
 
 def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
@@ -99,9 +99,7 @@ def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     for name, least in (("steps", 1), ("repeats", 1), ("iterations", 0), ("kernels", 1)):
-        value = getattr(args, name, None)
-        if value is not None and value < least:
-            raise ConfigError(f"--{name}: must be at least {least}, got {value}")
+        check_number(f"--{name}", getattr(args, name, None), least)
     if args.out is not None:
         ready_to_write(args.out)
     return cfg, device
@@ -146,19 +144,16 @@ def _last_line(text: str, code: int) -> str:
 def _write(args: argparse.Namespace, result: Any) -> None:
     """Write a result into the folder of --out, if one was given."""
     if args.out is not None:
-        make_folder(args.out)
-        write_text(args.out / RESULT, json.dumps(result, indent=1))
-
-
-def _add_kernels(parser: CommandParser) -> None:
-    _add_step_arguments(parser)
-    parser.add_argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)")
+        write_result(args.out / RESULT, result)
 
 
 @sub_command(
     "legged benchmark step anymal_c_flat --runner captured --out times",
     "legged benchmark step go2 --num-envs 8192 --policy go2",
-    add=_add_kernels,
+    arguments=(
+        *ITERATIONS,
+        argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)"),
+    ),
 )
 def step(args: argparse.Namespace) -> int:
     """Time a control step, the physics in it, and training iterations: `legged benchmark step anymal_c_flat`.
@@ -192,15 +187,10 @@ def step(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_robots(parser: CommandParser) -> None:
-    _add_step_arguments(parser)
-    parser.add_argument("--robots", required=True, help="numbers of robots, e.g. 1024,4096,16384")
-
-
 @sub_command(
     "legged benchmark scale anymal_c --robots 1024,4096,16384",
     "legged benchmark scale go2_flat --robots 256,1024 --iterations 0 --out times",
-    add=_add_robots,
+    arguments=(*ITERATIONS, argument("--robots", required=True, help="numbers of robots, e.g. 1024,4096,16384")),
 )
 def scale(args: argparse.Namespace) -> int:
     """Measure speed and memory against the number of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
@@ -252,7 +242,7 @@ def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, 
 @sub_command(
     "legged benchmark ground anymal_c",
     "legged benchmark ground go2 --num-envs 2048 --out times",
-    add=_add_steps,
+    arguments=STEPS,
 )
 def ground(args: argparse.Namespace) -> int:
     """Measure speed on different ground: `legged benchmark ground anymal_c`.
@@ -279,7 +269,7 @@ def ground(args: argparse.Namespace) -> int:
 @sub_command(
     "legged benchmark startup anymal_c_flat",
     "legged benchmark startup go2 --repeats 3 --out times",
-    add=_add_arguments,
+    arguments=MEASURED,
 )
 def startup(args: argparse.Namespace) -> int:
     """Time a training until it begins: `legged benchmark startup anymal_c_flat`.

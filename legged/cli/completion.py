@@ -12,6 +12,7 @@ from legged.commandline.command import sub_command
 from legged.config.reference import fields
 from legged.envs import BaseTask, LeggedRobot
 from legged.physics.fields import FIELDS
+from legged.process.command_parser import argument
 from legged.process.paths import data_folder
 from legged.registry import CLASSES
 from legged.terrain import TERRAIN_TYPES
@@ -53,7 +54,7 @@ _legged_complete_keys() { compadd -S '' -- ${(f)"$(_legged_next_keys "$PREFIX")"
 @sub_command(
     "legged completion bash > ~/.legged-completion",
     "legged completion zsh > ~/.legged-completion",
-    add=lambda parser: parser.add_argument("shell", choices=("bash", "zsh"), help="the shell that reads the script"),
+    arguments=[argument("shell", choices=("bash", "zsh"), help="the shell that reads the script")],
 )
 def completion(args: argparse.Namespace) -> int:
     """Print a completion script for a shell: `legged completion bash > ~/.legged-completion`.
@@ -80,7 +81,7 @@ def whole_parser() -> argparse.ArgumentParser:
         for action in parser._actions if name != "migrate" else ():  # tasks of `migrate` are names of legged_gym
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
-                action.complete = {"bash": function, "zsh": function}
+                action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
         if inside and group not in groups:
             parent = commands.choices.get(group) or commands.add_parser(group, help=f"commands of legged {group}")
             for action in parent._get_positional_actions():

@@ -1,47 +1,44 @@
-"""Export every checkpoint of a run: `legged export go1_flat`.
+"""`legged export`: ONNX files of a run."""
 
-Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. Their metadata hold
-the iteration and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the first of
-them that walks. `legged play` exports the last checkpoint alone.
-"""
-
+import argparse
 from pathlib import Path
 
 import torch
 
-from legged.commandline.arguments import add_policy_arguments, policy_overrides, register_given, settle_on
-from legged.commandline.command import command
+from legged.commandline.arguments import POLICY, policy_overrides, register_given, settle_on
+from legged.commandline.command import sub_command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
-from legged.policies.export import EXPORTED, export
+from legged.policies import export as exporting
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0
 """Largest size of the files of one policy [MiB]."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged export",
-        __doc__,
-        "legged export go1_flat --out policies",
-        "legged export anymal_c_flat/2026-11-22_05-38-19",
-    )
-    add_policy_arguments(parser)
-    out = "folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy"
-    parser.add_argument("--out", type=Path, help=out)
-    return parser
+@sub_command(
+    "legged export go1_flat --out policies",
+    "legged export anymal_c_flat/2026-11-22_05-38-19",
+    arguments=(
+        *POLICY,
+        argument(
+            "--out",
+            type=Path,
+            help="folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy",
+        ),
+    ),
+)
+def export(args: argparse.Namespace) -> int:
+    """Export every checkpoint of a run: `legged export go1_flat`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+    Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. Their metadata
+    hold the iteration and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the
+    first of them that walks. `legged play` exports the last checkpoint alone.
+    """
     register_given(args, "policy")
     if args.checkpoint is not None:
         raise ConfigError("--checkpoint: all checkpoints of the run are exported; leave it out")
@@ -51,7 +48,7 @@ def main(argv: list[str] | None) -> int:
     paths = checkpoints(policy.folder)
     if not paths:
         raise ConfigError(f"POLICY: {relative(policy.folder)} has no checkpoints of a training")
-    folder = args.out or policy.output("export") / EXPORTED
+    folder = args.out or policy.output("export") / exporting.EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
     # The C engine needs no compiler, and one robot is enough: nothing is simulated.
     calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
@@ -62,6 +59,6 @@ def main(argv: list[str] | None) -> int:
         seconds = read_checkpoint(path)["infos"].get("wall_s")
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
-        export(task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg)
+        exporting.export(task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg)
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0

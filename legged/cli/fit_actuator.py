@@ -1,14 +1,6 @@
-"""Fit a motor model to a log of a real motor: `legged fit-actuator log.npz --out fits/knee --joints KFE`.
+"""`legged fit-actuator`: a motor model from a log of a real motor."""
 
-The log has the arrays joint_names (D,), target, position, velocity and torque (T, D) in rad, rad/s and N m, and dt [s] or
-time (T,). The arrays run (T,), stiffness, damping and torque_limit may be added if they are known. Sample at 200 Hz or more:
-motion between two samples can't be learned.
-
-Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are judged on
-a fifth of the log that the fit has not seen. The folder gets actuator.yaml (a section control.actuator with the parts),
-network.npz (for control.actuator.network), fit.json and fit.png.
-"""
-
+import argparse
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError
 from legged.figures import figure
 from legged.fitting.log import ActuatorLog, check_alike, read_log
 from legged.fitting.parametric import Drive, fit_drive
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 
 UPDATES = {"mlp": 2000, "lstm": 3000}
@@ -48,32 +40,34 @@ class Fit:
     """(T, D) [N m]."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged fit-actuator",
-        __doc__,
-        "legged fit-actuator log.npz --out fits/anymal_c",
-        "legged fit-actuator log.npz --joints HFE,KFE --kind lstm --dt 0.005 --out fits/legs",
-    )
-    parser.add_argument("log", metavar="LOG", type=Path, help="the log, an .npz file")
-    parser.add_argument("--out", type=Path, default=Path("actuator"), help="folder that is written")
-    parser.add_argument("--joints", default="", help="parts of the names of the joints to fit; all by default")
-    parser.add_argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default")
-    parser.add_argument("--hidden", help="units of the network's layers; 32,32,32 by default, 8,8 for an lstm")
-    parser.add_argument("--samples", type=int, default=3, help="moments that an mlp sees; 3 by default")
-    parser.add_argument("--spacing", type=float, default=0.01, help="time between the moments of an mlp [s]; 0.01 by default")
-    parser.add_argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default")
-    parser.add_argument("--updates", type=int, help="updates of the network; 2000 by default, 3000 for an lstm")
-    parser.add_argument("--longest-delay", type=float, default=0.05, help="delays up to this are tried [s]; 0.05 by default")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the network's first weights")
-    return parser
+@sub_command(
+    "legged fit-actuator log.npz --out fits/anymal_c",
+    "legged fit-actuator log.npz --joints HFE,KFE --kind lstm --dt 0.005 --out fits/legs",
+    arguments=(
+        argument("log", metavar="LOG", type=Path, help="the log, an .npz file"),
+        argument("--out", type=Path, default=Path("actuator"), help="folder that is written"),
+        argument("--joints", default="", help="parts of the names of the joints to fit; all by default"),
+        argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default"),
+        argument("--hidden", help="units of the network's layers; 32,32,32 by default, 8,8 for an lstm"),
+        argument("--samples", type=int, default=3, help="moments that an mlp sees; 3 by default"),
+        argument("--spacing", type=float, default=0.01, help="time between the moments of an mlp [s]; 0.01 by default"),
+        argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default"),
+        argument("--updates", type=int, help="updates of the network; 2000 by default, 3000 for an lstm"),
+        argument("--longest-delay", type=float, default=0.05, help="delays up to this are tried [s]; 0.05 by default"),
+        argument("--seed", type=int, default=1, help="seed of the network's first weights"),
+    ),
+)
+def fit_actuator(args: argparse.Namespace) -> int:
+    """Fit a motor model to a log of a real motor: `legged fit-actuator log.npz --out fits/knee --joints KFE`.
 
+    The log has the arrays joint_names (D,), target, position, velocity and torque (T, D) in rad, rad/s and N m, and dt [s] or
+    time (T,). The arrays run (T,), stiffness, damping and torque_limit may be added if they are known. Sample at 200 Hz or
+    more: motion between two samples can't be learned.
 
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_args(argv)
+    Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are judged
+    on a fifth of the log that the fit has not seen. The folder gets actuator.yaml (a section control.actuator with the
+    parts), network.npz (for control.actuator.network), fit.json and fit.png.
+    """
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
     updates = UPDATES[args.kind] if args.updates is None else args.updates
     for flag, value, low, high in (

@@ -8,9 +8,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
 
-from legged.commandline.command import run_main
+from legged.commandline.command import SubCommand, run_main
 from legged.errors import ConfigError, suggest
 
 SECTIONS = {
@@ -23,27 +22,27 @@ SECTIONS = {
 """Heading of the help -> the first words of its commands."""
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    "train": ("legged.cli.train", "train a policy"),
-    "play": ("legged.cli.play", "film a policy, measure it and export it"),
-    "watch": ("legged.cli.watch", "watch a policy in the browser, also while it is trained"),
-    "evaluate": ("legged.cli.evaluate.policy", "measure a policy: what fits its task"),
-    "evaluate grid": ("legged.cli.evaluate.grid", "velocity errors over a grid of commands"),
-    "evaluate terrain": ("legged.cli.evaluate.terrain", "success against the size of stairs, gaps, slopes, ..."),
-    "evaluate stress": ("legged.cli.evaluate.stress", "disturbances, unknown ground and other solver settings"),
-    "evaluate checkpoints": ("legged.cli.evaluate.checkpoints", "the first checkpoint of a run that walks"),
-    "evaluate episodes": ("legged.cli.evaluate.episodes", "returns and lengths of episodes, for tasks without commands"),
-    "evaluate gymnasium": ("legged.cli.evaluate.gymnasium", "returns in Gymnasium's own environment"),
-    "evaluate onnx": ("legged.cli.evaluate.onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
-    "runs": ("legged.cli.runs.table", "all runs in one table (as `runs table`)"),
-    "runs table": ("legged.cli.runs.table", "all runs in one table"),
-    "runs report": ("legged.cli.runs.report", "a page about one run: settings, curves, evaluations, film"),
-    "runs compare": ("legged.cli.runs.compare", "settings, curves and evaluations of several runs side by side"),
-    "runs evaluations": ("legged.cli.runs.evaluations", "evaluation files side by side, seeds averaged"),
-    "runs curves": ("legged.cli.runs.curves", "learning curves of runs as a picture"),
-    "episodes record": ("legged.cli.episodes.record", "record episodes and list the worst"),
-    "episodes list": ("legged.cli.episodes.stored", "list recorded episodes, make pages of them"),
-    "episodes statistics": ("legged.cli.episodes.statistics", "mean and standard deviation of every joint"),
-    "episodes compare": ("legged.cli.episodes.compare", "joint statistics of two policies side by side"),
+    "train": ("legged.cli.train:train", "train a policy"),
+    "play": ("legged.cli.play:play", "film a policy, measure it and export it"),
+    "watch": ("legged.cli.watch:watch", "watch a policy in the browser, also while it is trained"),
+    "evaluate": ("legged.cli.evaluate:evaluate", "measure a policy: what fits its task"),
+    "evaluate grid": ("legged.cli.evaluate:grid", "velocity errors over a grid of commands"),
+    "evaluate terrain": ("legged.cli.evaluate:terrain", "success against the size of stairs, gaps, slopes, ..."),
+    "evaluate stress": ("legged.cli.evaluate:stress", "disturbances, unknown ground and other solver settings"),
+    "evaluate checkpoints": ("legged.cli.evaluate:checkpoints", "the first checkpoint of a run that walks"),
+    "evaluate episodes": ("legged.cli.evaluate:episodes", "returns and lengths of episodes, for tasks without commands"),
+    "evaluate gymnasium": ("legged.cli.evaluate:gymnasium", "returns in Gymnasium's own environment"),
+    "evaluate onnx": ("legged.cli.evaluate:onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
+    "runs": ("legged.cli.runs:runs", "all runs in one table (as `runs table`)"),
+    "runs table": ("legged.cli.runs:runs", "all runs in one table"),
+    "runs report": ("legged.cli.runs:report", "a page about one run: settings, curves, evaluations, film"),
+    "runs compare": ("legged.cli.runs:compare", "settings, curves and evaluations of several runs side by side"),
+    "runs evaluations": ("legged.cli.runs:evaluations", "evaluation files side by side, seeds averaged"),
+    "runs curves": ("legged.cli.runs:curves", "learning curves of runs as a picture"),
+    "episodes record": ("legged.cli.episodes:record", "record episodes and list the worst"),
+    "episodes list": ("legged.cli.episodes:list_", "list recorded episodes, make pages of them"),
+    "episodes statistics": ("legged.cli.episodes:statistics", "mean and standard deviation of every joint"),
+    "episodes compare": ("legged.cli.episodes:compare", "joint statistics of two policies side by side"),
     "sweep run": ("legged.cli.sweep:run", "search settings by many trainings"),
     "sweep report": ("legged.cli.sweep:report", "table and figures of a sweep"),
     "benchmark step": ("legged.cli.benchmark:step", "times of a control step and of training iterations"),
@@ -53,16 +52,16 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "robot add": ("legged.cli.robot:add", "turn a URDF or MJCF file into a robot and a task"),
     "robot show": ("legged.cli.robot:show", "joints, limits, gains and feet of a robot"),
     "terrain": ("legged.cli.terrain:terrain", "pictures of a task's terrain"),
-    "export": ("legged.cli.export", "export every checkpoint of a run to ONNX"),
-    "deploy sim": ("legged.cli.deploy.sim", "run the robot's program against a simulated robot"),
-    "deploy robot": ("legged.cli.deploy.robot", "serve a simulated robot over UDP"),
-    "fit-actuator": ("legged.cli.fit_actuator", "fit a motor model to a log of a real motor"),
-    "migrate": ("legged.cli.migrate", "translate a legged_gym configuration"),
+    "export": ("legged.cli.export:export", "export every checkpoint of a run to ONNX"),
+    "deploy sim": ("legged.cli.deploy.sim:sim", "run the robot's program against a simulated robot"),
+    "deploy robot": ("legged.cli.deploy.robot:robot", "serve a simulated robot over UDP"),
+    "fit-actuator": ("legged.cli.fit_actuator:fit_actuator", "fit a motor model to a log of a real motor"),
+    "migrate": ("legged.cli.migrate:migrate", "translate a legged_gym configuration"),
     "warmup": ("legged.cli.warmup:warmup", "compile and cache the kernels of a task"),
     "completion": ("legged.cli.completion:completion", "print a completion script for a shell"),
-    "list": ("legged.cli.listing", "list tasks and robots"),
+    "list": ("legged.cli.list:list_", "list tasks and robots"),
 }
-"""Words of a command -> its module, or a SubCommand in a module, and a summary. Both have `build_parser` and `main`."""
+"""Words of a command -> its module and its name there, and a summary."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -73,15 +72,15 @@ def main(argv: list[str] | None = None) -> int:
         return run_main(lambda _: _print_help(words), argv)
     found = load(name)
     if argv is not None:
-        return found.main(rest)  # type: ignore[no-any-return]
+        return found.main(rest)
     sys.argv = [sys.argv[0], *rest]
-    return found.main()  # type: ignore[no-any-return]
+    return found.main()
 
 
-def load(name: str) -> Any:
-    """Import a command; return its module or its SubCommand."""
+def load(name: str) -> SubCommand:
+    """Import and return a command."""
     module, _, inside = COMMANDS[name][0].partition(":")
-    return getattr(import_module(module), inside) if inside else import_module(module)
+    return getattr(import_module(module), inside)  # type: ignore[no-any-return]
 
 
 def split(words: list[str]) -> tuple[str | None, list[str]]:

@@ -1,10 +1,4 @@
-"""Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
-
-The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and the like
-need not be installed. From the live classes it writes <task>.yaml with the settings that differ from the defaults, and
-robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are the fork's own, and
-lists every setting without a counterpart, with file and line.
-"""
+"""`legged migrate`: a task from a configuration of legged_gym."""
 
 import argparse
 import os
@@ -12,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError
@@ -21,7 +15,7 @@ from legged.migration.reading import read_fork
 from legged.migration.robot_entries import asset_of, map_robot, names_of
 from legged.migration.translation import Translation
 from legged.migration.writer import robot_yaml, task_yaml
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot
@@ -30,27 +24,26 @@ FIRST = ("rewards", "observations", "robot")
 """Subjects of the first lines of the report."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged migrate",
-        __doc__,
-        "legged migrate legged_gym/envs/go2/go2_config.py --robot go2 --run",
-        "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks --run",
-    )
-    parser.add_argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes")
-    parser.add_argument("--run", action="store_true", help="run the file and the modules that it imports")
-    parser.add_argument("--task", help="class or registered task to migrate, or a name for the only one")
-    parser.add_argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one")
-    parser.add_argument("--out", type=Path, default=Path("."), help="folder for the files that are written")
-    parser.add_argument("--force", action="store_true", help="write over files of the same names")
-    return parser
+@sub_command(
+    "legged migrate legged_gym/envs/go2/go2_config.py --robot go2 --run",
+    "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks --run",
+    arguments=(
+        argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes"),
+        argument("--run", action="store_true", help="run the file and the modules that it imports"),
+        argument("--task", help="class or registered task to migrate, or a name for the only one"),
+        argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one"),
+        argument("--out", type=Path, default=Path("."), help="folder for the files that are written"),
+        argument("--force", action="store_true", help="write over files of the same names"),
+    ),
+)
+def migrate(args: argparse.Namespace) -> int:
+    """Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_args(argv)
+    The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and the
+    like need not be installed. From the live classes it writes <task>.yaml with the settings that differ from the defaults,
+    and robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are the fork's
+    own, and lists every setting without a counterpart, with file and line.
+    """
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
     if args.file.suffix != ".py":

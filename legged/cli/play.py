@@ -1,7 +1,4 @@
-"""Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
-
-On a display a window opens first, in which the robot follows the arrow keys.
-"""
+"""`legged play`: a film, the measured errors and the exported files of a policy."""
 
 import argparse
 import os
@@ -12,7 +9,8 @@ import torch
 from rich.console import Console
 
 from legged.commandline.arguments import (
-    add_legged_gym_arguments,
+    TILES,
+    of_legged_gym,
     pick_device,
     policy_overrides,
     register_given,
@@ -20,7 +18,7 @@ from legged.commandline.arguments import (
     settle_on,
     watch_command,
 )
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError, RunError
@@ -33,7 +31,7 @@ from legged.policies.actor import Actor
 from legged.policies.episodes import for_episodes
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import TrainedPolicy, policy_of, restore, undisturbed
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.headless import HEADLESS
 from legged.process.paths import ready_to_write, relative
 from legged.registry import task_config
@@ -47,28 +45,23 @@ SHOWN_ON_A_PLANE = 4
 """Default number of robots."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged play",
-        __doc__,
-        "legged play anymal_c --terrain stairs_up --difficulty 0.8",
-        "legged play anymal_c_flat/2026-11-22_05-38-19 --headless --gif",
-    )
-    add_legged_gym_arguments(parser, "policy")
-    parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
-    parser.add_argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default")
-    parser.add_argument("--headless", action="store_true", help="record even where there is a display")
-    parser.add_argument("--gif", action="store_true", help="also write a GIF")
-    parser.add_argument("--no-video", action="store_true", help="export and measure only")
-    parser.add_argument("--out", type=Path, help="folder for video and exported/; the run folder by default")
-    return parser
+@sub_command(
+    "legged play anymal_c --terrain stairs_up --difficulty 0.8",
+    "legged play anymal_c_flat/2026-11-22_05-38-19 --headless --gif",
+    arguments=(
+        *of_legged_gym("policy"),
+        *TILES,
+        argument("--headless", action="store_true", help="record even where there is a display"),
+        argument("--gif", action="store_true", help="also write a GIF"),
+        argument("--no-video", action="store_true", help="export and measure only"),
+        argument("--out", type=Path, help="folder for video and exported/; the run folder by default"),
+    ),
+)
+def play(args: argparse.Namespace) -> int:
+    """Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+    On a display a window opens first, in which the robot follows the arrow keys.
+    """
     if args.gif and args.no_video:
         raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
     settle_name(args, "policy")

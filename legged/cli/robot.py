@@ -12,7 +12,7 @@ from rich.table import Table
 from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
@@ -26,24 +26,22 @@ ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
 
 
-def _add_arguments(parser: CommandParser) -> None:
-    parser.add_argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME")
-    parser.add_argument("--name", help="name of the robot; that of the file by default")
-    parser.add_argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default")
-    parser.add_argument("--extends", metavar="TASK", help="task to take rewards from; base/quadruped_flat or base/biped_flat")
-    parser.add_argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated")
-    parser.add_argument(
-        "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
-    )
-    parser.add_argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default")
-    parser.add_argument("--damping", type=float, help="D gain of all joints [N m s/rad]")
-    parser.add_argument("--force", action="store_true", help="write over a robot of that name")
-
-
 @sub_command(
     "legged robot add path/to/my_robot.urdf --out mine",
     "legged robot add menagerie:unitree_go2 --name my_go2",
-    add=_add_arguments,
+    arguments=(
+        argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
+        argument("--name", help="name of the robot; that of the file by default"),
+        argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default"),
+        argument("--extends", metavar="TASK", help="task to take rewards from; base/quadruped_flat or base/biped_flat"),
+        argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated"),
+        argument(
+            "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
+        ),
+        argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default"),
+        argument("--damping", type=float, help="D gain of all joints [N m s/rad]"),
+        argument("--force", action="store_true", help="write over a robot of that name"),
+    ),
 )
 def add(args: argparse.Namespace) -> int:
     """Turn a URDF or MJCF file into a robot and a task: `legged robot add my_robot.urdf`.
@@ -156,7 +154,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
 @sub_command(
     "legged robot show go2",
     "legged robot show mine/my_robot",
-    add=lambda parser: parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
+    arguments=[argument("robot", metavar="ROBOT", help="name of a robot, or its folder")],
 )
 def show(args: argparse.Namespace) -> int:
     """Print joints, limits, gains and feet of a robot: `legged robot show go2`.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from legged.cli.train import train
-from legged.commandline.arguments import pick_device
+from legged.commandline.arguments import import_given, pick_device
 from legged.commandline.command import EXIT_FAILED, stopping_on_signals, sub_command
 from legged.config.checks import shown
 from legged.errors import ConfigError
@@ -24,12 +24,11 @@ from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Evaluated, reaches
 from legged.learning.run_folder import NOTE_FILE
 from legged.learning.runner import Runner
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import IMPORT, argument, check_number
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.process.processes import Job, Kind, WorkerPool, why_failed
 from legged.process.ranks import Ranks
-from legged.registry import import_tasks
 from legged.sweeping.plan import Plan, plan_sweep, sweep_file
 from legged.sweeping.trials import RUNS, WHY, Trials, finished, repeating, write_report
 
@@ -47,12 +46,13 @@ MOST_FAILURES = 3
 """Failed trials in a row after which a worker gives up."""
 
 
-def _add_sweep_arguments(parser: CommandParser) -> None:
-    """Add the arguments that choose a sweep."""
-    parser.add_argument("file", metavar="FILE", help="YAML file of the sweep, or the name of one in cfg/sweeps")
-    parser.add_argument("--sim-device", help="cpu, cuda, or a list with commas, from which the jobs take theirs")
-    parser.add_argument("--storage", help="URL of a database that several machines share, or journal:<file>")
-    add_import_argument(parser)
+SWEEP = (
+    argument("file", metavar="FILE", help="YAML file of the sweep, or the name of one in cfg/sweeps"),
+    argument("--sim-device", help="cpu, cuda, or a list with commas, from which the jobs take theirs"),
+    argument("--storage", help="URL of a database that several machines share, or journal:<file>"),
+    IMPORT,
+)
+"""Arguments that choose a sweep."""
 
 
 def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, list[torch.device]]:
@@ -65,24 +65,21 @@ def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, 
     devices = [pick_device(name) for name in args.sim_device.split(",")] if args.sim_device else [pick_device(None)]
     if len({device.type for device in devices}) > 1:
         raise ConfigError(f"--sim-device: {shown(args.sim_device)}: trials on a CPU and on a GPU can't be compared")
-    if args.module:
-        import_tasks(args.module)
+    import_given(args)
     plan = plan_sweep(sweep_file(args.file), devices[0].type == "cpu", trials)
     ready_to_write(plan.folder)
     return plan, devices
 
 
-def _add_run_arguments(parser: CommandParser) -> None:
-    _add_sweep_arguments(parser)
-    parser.add_argument("--trials", type=int, help="trials in all, of all processes; those of the file by default")
-    parser.add_argument("--jobs", type=int, help="processes side by side; one for each device by default")
-    parser.add_argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS)
-
-
 @sub_command(
     "legged sweep run anymal_c_flat",
     "legged sweep run cfg/sweeps/anymal_c_flat.yaml --trials 60 --jobs 4",
-    add=_add_run_arguments,
+    arguments=(
+        *SWEEP,
+        argument("--trials", type=int, help="trials in all, of all processes; those of the file by default"),
+        argument("--jobs", type=int, help="processes side by side; one for each device by default"),
+        argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS),
+    ),
 )
 def run(args: argparse.Namespace) -> int:
     """Search settings that learn better or sooner: `legged sweep run anymal_c_flat`.
@@ -94,10 +91,8 @@ def run(args: argparse.Namespace) -> int:
     """
     if Ranks.now().several:
         raise ConfigError("sweep: starts its processes by itself; run it without torchrun")
-    for flag in ("jobs", "trials"):
-        value = getattr(args, flag)
-        if value is not None and value < 1:
-            raise ConfigError(f"--{flag}: must be at least 1, got {value}")
+    check_number("--jobs", args.jobs, 1)
+    check_number("--trials", args.trials, 1)
     plan, devices = _settle(args, args.trials)
     jobs = args.jobs or len(devices)
     trials = Trials(plan, args.storage or "", args.worker or 0)
@@ -317,7 +312,7 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
 @sub_command(
     "legged sweep report anymal_c_flat",
     "legged sweep report cfg/sweeps/anymal_c_flat.yaml --storage journal:sweep.log",
-    add=_add_sweep_arguments,
+    arguments=SWEEP,
 )
 def report(args: argparse.Namespace) -> int:
     """Write table and figures of a sweep: `legged sweep report anymal_c_flat`.

@@ -7,25 +7,27 @@ from pathlib import Path
 
 from PIL import Image
 
-from legged.commandline.arguments import add_task_arguments, overrides, register_given
+from legged.commandline.arguments import TASK, overrides, register_given
 from legged.commandline.command import sub_command
 from legged.config import LeggedConfig
 from legged.errors import ConfigError
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
 from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles
 from legged.terrain import Terrain, check_terrain, terrain_types
 
 
-def _add_arguments(parser: CommandParser) -> None:
-    add_task_arguments(parser)
-    parser.add_argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap")
-    parser.add_argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1")
-    parser.add_argument("--out", type=Path, default=Path("."), help="folder for the two PNG files")
-
-
-@sub_command("legged terrain anymal_c", "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7", add=_add_arguments)
+@sub_command(
+    "legged terrain anymal_c",
+    "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7",
+    arguments=(
+        *TASK,
+        argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap"),
+        argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1"),
+        argument("--out", type=Path, default=Path("."), help="folder for the two PNG files"),
+    ),
+)
 def terrain(args: argparse.Namespace) -> int:
     """Draw a task's terrain: `legged terrain anymal_c`.
 

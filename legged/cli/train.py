@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from legged.commandline.arguments import (
-    add_legged_gym_arguments,
     given_import,
+    of_legged_gym,
     overrides,
     pick_device,
     register_given,
@@ -45,7 +45,7 @@ from legged.learning.timing import Timing, write_timing
 from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.cores import available_cores
 from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
@@ -57,31 +57,25 @@ ROOM_MB = 16.0
 """Disk space that must be free before a training begins, for its first checkpoints [MiB]."""
 
 
-def _add_arguments(parser: CommandParser) -> None:
-    add_legged_gym_arguments(parser, "task")
-    parser.add_argument("--resume", action="store_true", help="continue from a checkpoint, in a new run folder")
-    parser.add_argument(
-        "--transfer", metavar="POLICY", help="begin with the networks of another training, also of another task"
-    )
-    parser.add_argument("--teacher", metavar="POLICY", help="policy that a student imitates (train.distillation.teacher)")
-    parser.add_argument("--run-name", help="appended to the run folder's name")
-    parser.add_argument("--max-iterations", type=int, help="length of the whole training")
-    parser.add_argument("--note", help="a sentence about this run, for its report and the table of all runs")
-    parser.add_argument("--rl-device", help="device of the networks; that of the simulation by default")
-    parser.add_argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)")
-    parser.add_argument("--headless", action="store_true", help="without effect; legged_gym has this option")
-    parser.add_argument(
-        "--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"
-    )
-
-
 @sub_command(
     "legged train anymal_c_flat",
     "legged train anymal_c --num-envs 8192 --seed 3 rewards.scales.torques=-1e-4",
     "legged train anymal_c --resume",
     "legged train anymal_c_step --transfer anymal_c_flat",
     "legged train anymal_c_student --teacher anymal_c",
-    add=_add_arguments,
+    arguments=(
+        *of_legged_gym("task"),
+        argument("--resume", action="store_true", help="continue from a checkpoint, in a new run folder"),
+        argument("--transfer", metavar="POLICY", help="begin with the networks of another training, also of another task"),
+        argument("--teacher", metavar="POLICY", help="policy that a student imitates (train.distillation.teacher)"),
+        argument("--run-name", help="appended to the run folder's name"),
+        argument("--max-iterations", type=int, help="length of the whole training"),
+        argument("--note", help="a sentence about this run, for its report and the table of all runs"),
+        argument("--rl-device", help="device of the networks; that of the simulation by default"),
+        argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)"),
+        argument("--headless", action="store_true", help="without effect; legged_gym has this option"),
+        argument("--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"),
+    ),
 )
 def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = None) -> int:
     """Train a policy: `legged train anymal_c_flat`, or `python train.py --task anymal_c_flat`."""
@@ -156,9 +150,6 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
         return 0
     # No signal of this process: its output was lost, or another process was told to stop.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
-
-
-build_parser, main = train.build_parser, train.main
 
 
 def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:

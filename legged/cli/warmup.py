@@ -3,13 +3,13 @@
 import argparse
 import time
 
-from legged.commandline.arguments import add_task_arguments, overrides, pick_device, register_given, settle_on
+from legged.commandline.arguments import TASK, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import sub_command
 from legged.physics import kernel_cache, resolve_physics
 from legged.registry import make_task, task_config
 
 
-@sub_command("legged warmup anymal_c", "legged warmup go2_flat --num-envs 8192", add=add_task_arguments)
+@sub_command("legged warmup anymal_c", "legged warmup go2_flat --num-envs 8192", arguments=TASK)
 def warmup(args: argparse.Namespace) -> int:
     """Compile and cache the kernels of a task: `legged warmup anymal_c`.
 

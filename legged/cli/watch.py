@@ -1,28 +1,26 @@
-"""Watch a policy in a browser, also while it is trained: `legged watch anymal_c_flat`.
+"""`legged watch`: a policy in the browser."""
 
-The page shows the newest checkpoint of the run, and the next one as soon as it is written. Without POLICY the newest run of
-all is shown. The page sets commands, terrain, pushes and the speed of time.
-"""
-
+import argparse
 import math
 import sys
 from typing import Any
 
 from legged.commandline.arguments import (
+    BUILD,
+    CHECKPOINT,
     POLICY_HELP,
-    add_build_arguments,
-    add_checkpoint_argument,
+    TILES,
     override_is_no_name,
     pick_device,
     policy_overrides,
     register_given,
     settle_on,
 )
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.errors import ConfigError
 from legged.play.live.page import HOST, PORT, Page, free_port, is_loopback, load_viser, url
 from legged.play.live.session import MOST_ROBOTS, Session, changes_for, check_ground, find_watched
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument
 from legged.process.cores import available_cores
 
 ROBOTS = 4
@@ -31,28 +29,24 @@ ROBOTS_A_THREAD = 4
 """Number of robots that one core simulates in real time."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged watch",
-        __doc__,
-        "legged watch anymal_c_flat",
-        "legged watch anymal_c_flat/2026-11-22_05-38-19 --terrain stairs_up",
-    )
-    parser.add_argument("policy", nargs="?", metavar="POLICY", help=f"{POLICY_HELP}; the newest run of all by default")
-    add_checkpoint_argument(parser)
-    add_build_arguments(parser)
-    parser.add_argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default")
-    parser.add_argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default")
-    parser.add_argument("--host", default=HOST, help="address that is listened at; this machine alone by default")
-    parser.add_argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default")
-    return parser
+@sub_command(
+    "legged watch anymal_c_flat",
+    "legged watch anymal_c_flat/2026-11-22_05-38-19 --terrain stairs_up",
+    arguments=(
+        argument("policy", nargs="?", metavar="POLICY", help=f"{POLICY_HELP}; the newest run of all by default"),
+        CHECKPOINT,
+        *BUILD,
+        *TILES,
+        argument("--host", default=HOST, help="address that is listened at; this machine alone by default"),
+        argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default"),
+    ),
+)
+def watch(args: argparse.Namespace) -> int:
+    """Watch a policy in a browser, also while it is trained: `legged watch anymal_c_flat`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+    The page shows the newest checkpoint of the run, and the next one as soon as it is written. Without POLICY the newest run
+    of all is shown. The page sets commands, terrain, pushes and the speed of time.
+    """
     override_is_no_name(args, "policy")
     register_given(args, "policy")
     port = free_port(args.host, args.port)

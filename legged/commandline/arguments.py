@@ -10,58 +10,62 @@ import torch
 
 from legged.config import parse_override
 from legged.errors import ConfigError
-from legged.process.command_parser import add_import_argument
+from legged.process.command_parser import IMPORT, Argument, argument
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.process.startup import program
 from legged.registry import YAML_ENDINGS, import_tasks, register_file
 
 TASK_HELP = "a task, e.g. anymal_c_flat, or its YAML file"
+POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 OVERRIDE = re.compile(r"[\w.]+=")
 """The beginning of a `key=value`; a text with a slash before the equals sign is a path."""
-POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 
 
-def add_task_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the positional argument TASK, --import, the options of `add_build_arguments`, and `key=value` overrides."""
-    parser.add_argument("task", metavar="TASK", help=TASK_HELP)
-    add_build_arguments(parser)
+def _iteration(text: str) -> int | str:
+    """Return the iteration of a checkpoint, or `best`; argparse reports any other text."""
+    try:
+        return text if text == "best" else int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
 
 
-def add_policy_arguments(parser: argparse.ArgumentParser, what: str = POLICY_HELP) -> None:
-    """Add the positional argument POLICY, --checkpoint, and the arguments of `add_build_arguments`."""
-    parser.add_argument("policy", metavar="POLICY", help=what)
-    add_checkpoint_argument(parser)
-    add_build_arguments(parser)
+BUILD = (
+    IMPORT,
+    argument("--num-envs", type=int, help="number of robots (env.num_envs)"),
+    argument("--seed", type=int, help="random seed (env.seed)"),
+    argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default"),
+    argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default"),
+    argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one"),
+    argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph"),
+    argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4"),
+)
+"""Arguments that determine how a task is built: --import, engine, devices, and `key=value` overrides."""
+TASK = (argument("task", metavar="TASK", help=TASK_HELP), *BUILD)
+"""The positional argument TASK, and those of `BUILD`."""
+CHECKPOINT = argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
+"""The option that chooses among the checkpoints of a run."""
+POLICY = (argument("policy", metavar="POLICY", help=POLICY_HELP), CHECKPOINT, *BUILD)
+"""The positional argument POLICY, --checkpoint, and the arguments of `BUILD`."""
+TILES = (
+    argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default"),
+    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default"),
+)
+"""Options that choose the tiles on which a policy is shown."""
 
 
-def add_checkpoint_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --checkpoint, which chooses among the checkpoints of a run."""
-    parser.add_argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
-
-
-def add_legged_gym_arguments(parser: argparse.ArgumentParser, name: str) -> None:
-    """Add the options of `train` and `play` that legged_gym has too: --task in place of the positional argument `name`, and
-    the options that name one of the task's runs.
+def of_legged_gym(name: str) -> tuple[Argument, ...]:
+    """Return the arguments of `train` and `play` that legged_gym has too: --task in place of the positional argument `name`,
+    and the options that name one of the task's runs.
     """
-    parser.add_argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP)
-    parser.add_argument("--task", dest="task_option", metavar="TASK", help=f"the same as {name.upper()}, as in legged_gym")
-    parser.add_argument("--experiment-name", help="folder under logs/; the task's name by default")
-    parser.add_argument("--load-run", metavar="RUN", help="a run of the task, by name or folder; the newest by default")
-    add_checkpoint_argument(parser)
-    add_build_arguments(parser)
-
-
-def add_build_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that determine how a task is built: --import, engine, devices, and `key=value` overrides."""
-    add_import_argument(parser)
-    parser.add_argument("--num-envs", type=int, help="number of robots (env.num_envs)")
-    parser.add_argument("--seed", type=int, help="random seed (env.seed)")
-    parser.add_argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default")
-    parser.add_argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default")
-    parser.add_argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one")
-    parser.add_argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4")
+    return (
+        argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP),
+        argument("--task", dest="task_option", metavar="TASK", help=f"the same as {name.upper()}, as in legged_gym"),
+        argument("--experiment-name", help="folder under logs/; the task's name by default"),
+        argument("--load-run", metavar="RUN", help="a run of the task, by name or folder; the newest by default"),
+        CHECKPOINT,
+        *BUILD,
+    )
 
 
 def settle_name(args: argparse.Namespace, name: str) -> None:
@@ -87,14 +91,6 @@ def override_is_no_name(args: argparse.Namespace, name: str) -> None:
     if given is not None and OVERRIDE.match(given):
         args.overrides.insert(0, given)
         setattr(args, name, None)
-
-
-def _iteration(text: str) -> int | str:
-    """Return the iteration of a checkpoint, or `best`; argparse reports any other text."""
-    try:
-        return text if text == "best" else int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
@@ -130,6 +126,21 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
         ConfigError: as `overrides`.
     """
     return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
+
+
+def velocity_command(text: str) -> tuple[float, float, float]:
+    """Return vx, vy [m/s] and yaw rate [rad/s] of --command.
+
+    Raises:
+        ConfigError: they are not three numbers, or one is too large.
+    """
+    try:
+        vx, vy, yaw = (float(part) for part in text.split(","))
+    except ValueError:
+        vx = vy = yaw = float("nan")
+    if not all(abs(value) <= 100.0 for value in (vx, vy, yaw)):
+        raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{text}'")
+    return vx, vy, yaw
 
 
 def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
@@ -174,6 +185,18 @@ def settle_on(device: torch.device) -> None:
         torch.cuda.set_device(device)  # operations without a device must not run on the first GPU
 
 
+def measuring_device(args: argparse.Namespace) -> torch.device:
+    """Return the device of a command that measures a policy, on which torch is then settled: that of --sim-device; without
+    it the CPU for `--physics mujoco`.
+
+    Raises:
+        ConfigError: as `pick_device`.
+    """
+    device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
+    settle_on(device)
+    return device
+
+
 def watch_command(args: argparse.Namespace, folder: Path) -> str:
     """Return the command that shows the policy of a run folder in a browser, also during the training. `args` are the
     arguments of the running command.
@@ -187,10 +210,15 @@ def given_import(args: argparse.Namespace) -> list[str]:
     return ["--import", ",".join(files)] if files else []
 
 
-def register_given(args: argparse.Namespace, name: str) -> None:
-    """Register the user-defined tasks of --import; a YAML file in `args.<name>` becomes a task."""
+def import_given(args: argparse.Namespace) -> None:
+    """Register the user-defined tasks of --import, if it is given."""
     if args.module:
         import_tasks(args.module)
+
+
+def register_given(args: argparse.Namespace, name: str) -> None:
+    """Register the user-defined tasks of --import; a YAML file in `args.<name>` becomes a task."""
+    import_given(args)
     given = getattr(args, name)
     args.task_file = given if given is not None and given.endswith(YAML_ENDINGS) else None
     if args.task_file:

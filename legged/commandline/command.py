@@ -2,7 +2,6 @@
 
 import argparse
 import errno
-import functools
 import inspect
 import os
 import re
@@ -20,7 +19,7 @@ from typing import Any, TextIO
 
 import legged.errors
 from legged.errors import ConfigError, HostReadError, RunError, TermError
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import Argument, CommandParser
 from legged.process.paths import DISK_FULL, full_disk_in, reason
 from legged.process.ranks import Ranks
 from legged.process.startup import (
@@ -77,26 +76,23 @@ def _engine_warnings() -> AbstractContextManager[None]:
     return each_warning_once()
 
 
-def command(main: Callable[[list[str] | None], int]) -> Callable[..., int]:
-    """Let the main function of a command end as `run_main` describes. Its argument may be left out then."""
-    return functools.partial(run_main, main)
-
-
 class SubCommand:
     """A command that is a function of parsed arguments: `legged <module> <function>`, or `legged <module>` if it is called
-    like its module. In the arguments, `words` is the whole command line, and `start_s` the start of the command on the clock
-    of `time.perf_counter` [s]; the start of a process includes its imports.
+    like its module in `legged.cli`. In a name, `_` is a hyphen, and one at the end is left out.
+
+    In the arguments, `words` is the whole command line, and `start_s` the start of the command on the clock of
+    `time.perf_counter` [s]; the start of a process includes its imports.
     """
 
-    def __init__(self, run: Callable[..., int], examples: Sequence[str], add: Callable[[CommandParser], object]) -> None:
-        self.run, self._examples, self._add = run, examples, add
+    def __init__(self, run: Callable[..., int], examples: Sequence[str], arguments: Sequence[Argument]) -> None:
+        self.run, self._examples, self._arguments = run, examples, arguments
 
     def build_parser(self) -> CommandParser:
         """Return the parser of the command line."""
-        words = dict.fromkeys((self.run.__module__.rpartition(".")[2], self.run.__name__))
-        parser = CommandParser(" ".join(["legged", *words]), inspect.getdoc(self.run), *self._examples)
-        self._add(parser)
-        return parser
+        names = (*self.run.__module__.split(".")[2:], self.run.__name__)
+        words = dict.fromkeys(name.rstrip("_").replace("_", "-") for name in names)
+        described = inspect.getdoc(self.run)
+        return CommandParser(" ".join(["legged", *words]), described, *self._examples, arguments=self._arguments)
 
     def parse(self, argv: list[str] | None) -> argparse.Namespace:
         """Return the arguments of a command line, of this process if None."""
@@ -110,11 +106,11 @@ class SubCommand:
         return run_main(lambda words: self.run(self.parse(words)), argv)
 
 
-def sub_command(*examples: str, add: Callable[[CommandParser], object]) -> Callable[[Callable[..., int]], SubCommand]:
+def sub_command(*examples: str, arguments: Sequence[Argument] = ()) -> Callable[[Callable[..., int]], SubCommand]:
     """Make a function of parsed arguments a sub-command, whose exit code it returns. Its docstring is the description of the
-    help, which ends with `examples`; `add` adds its arguments to the parser.
+    help, which ends with `examples`.
     """
-    return lambda run: SubCommand(run, examples, add)
+    return lambda run: SubCommand(run, examples, arguments)
 
 
 def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:

@@ -21,11 +21,9 @@ from legged.deploy.safety import Limits
 from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import KINDS, SdkWire, UnitreeRobot
 from legged.errors import ConfigError, RunError, suggest
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import CommandParser, argument, check_between
 from legged.process.paths import ready_to_write
 
-BOUNDS = {"stand_seconds": (1.0, 60.0), "max_tilt": (0.1, 1.6), "max_age": (0.005, 0.5), "max_missed": (1, 50)}
-"""Flag -> its smallest and largest value, in seconds, radians and cycles; degrees or milliseconds are refused."""
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 """Signals that end the program after the robot was braked: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and
 Ctrl-Z. By default most of them would leave the robot with its last command."""
@@ -33,6 +31,22 @@ SWITCH_S = 5e-4
 """Python's switch interval between threads [s]; the default of 5 ms is a quarter of a cycle."""
 EXIT_STOPPED = 3
 """The program ran to its end, but had stopped the robot for safety."""
+PROGRAM = (
+    argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard"),
+    argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}"),
+    argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad"),
+    argument("--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"),
+    argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3"),
+    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop beyond this [rad]; default {Limits.max_tilt:g}"),
+    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop at older data [s]; default {Limits.max_age_s:g}"),
+    argument(
+        "--max-missed",
+        type=int,
+        default=Limits.max_missed,
+        help=f"stop at so many missed in a row; default {Limits.max_missed}",
+    ),
+)
+"""Options of the program that do not depend on the robot."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -51,19 +65,20 @@ def main(argv: list[str] | None = None) -> int:
 
 def build_parser() -> CommandParser:
     """Return the parser of the command line."""
-    parser = CommandParser(
+    return CommandParser(
         "python -m legged.deploy",
         __doc__,
         "python -m legged.deploy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
         "python -m legged.deploy exported --robot go2 --network eth0 --input gamepad",
+        arguments=(
+            argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and policy.json"),
+            *PROGRAM,
+            argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}"),
+            argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default"),
+            argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0"),
+            argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz"),
+        ),
     )
-    parser.add_argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and policy.json")
-    add_program_arguments(parser)
-    parser.add_argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}")
-    parser.add_argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default")
-    parser.add_argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0")
-    parser.add_argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz")
-    return parser
 
 
 def _main(argv: list[str] | None) -> int:
@@ -109,32 +124,18 @@ def _main(argv: list[str] | None) -> int:
     return EXIT_STOPPED if program.stops else 0
 
 
-def add_program_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the program that do not depend on the robot."""
-    parser.add_argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard")
-    parser.add_argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}")
-    parser.add_argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad")
-    never = float("inf")
-    parser.add_argument("--seconds", type=float, default=never, help="end after so long; at the operator's word by default")
-    parser.add_argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3")
-    tilt, age, missed = Limits.max_tilt, Limits.max_age_s, Limits.max_missed
-    parser.add_argument("--max-tilt", type=float, default=tilt, help=f"stop beyond this [rad]; default {tilt:g}")
-    parser.add_argument("--max-age", type=float, default=age, help=f"stop at older data [s]; default {age:g}")
-    parser.add_argument("--max-missed", type=int, default=missed, help=f"stop at so many missed in a row; default {missed}")
-
-
 def limits_of(args: argparse.Namespace) -> Limits:
-    """Return the limits of the flags.
+    """Return the limits of the flags, in seconds, radians and cycles; degrees or milliseconds are refused.
 
     Raises:
         ConfigError: a number is outside its range.
     """
     if not args.seconds > 0.0:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
-    for flag, (low, high) in BOUNDS.items():
-        value = getattr(args, flag)
-        if not low <= value <= high:
-            raise ConfigError(f"--{flag.replace('_', '-')}: must be between {low:g} and {high:g}, got {value:g}")
+    check_between("--stand-seconds", args.stand_seconds, 1.0, 60.0)
+    check_between("--max-tilt", args.max_tilt, 0.1, 1.6)
+    check_between("--max-age", args.max_age, 0.005, 0.5)
+    check_between("--max-missed", args.max_missed, 1, 50)
     return Limits(max_tilt=args.max_tilt, max_age_s=args.max_age, max_missed=args.max_missed)
 
 

@@ -1,12 +1,17 @@
 """Argument parser of every command, with paragraphs and examples in its help and a suggestion for a wrong option."""
 
 import argparse
+import math
 import re
 import sys
 import textwrap
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
-from legged.errors import suggest
+from legged.errors import ConfigError, suggest
+
+Argument = Callable[[argparse.ArgumentParser], object]
+"""A function that adds an argument to a parser."""
 
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 """Negative numbers, which look like options. Before Python 3.14 argparse does not know -1e-1."""
@@ -17,15 +22,17 @@ OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_i
 class CommandParser(argparse.ArgumentParser):
     """Parser of one command's arguments, whose help ends with examples."""
 
-    def __init__(self, prog: str, description: str | None, *examples: str, **options: Any) -> None:
-        """Take the words that call the command, its description, and at least two examples as complete command lines."""
+    def __init__(self, prog: str, description: str | None, *examples: str, arguments: Iterable[Argument] = ()) -> None:
+        """Take the words that call the command, its description, at least two examples as complete command lines, and its
+        arguments.
+        """
         self.examples = examples
         """Command lines that this parser can parse."""
         shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
-        super().__init__(
-            prog=prog, description=description, epilog=shown, formatter_class=Paragraphs, allow_abbrev=False, **options
-        )
+        super().__init__(prog=prog, description=description, epilog=shown, formatter_class=Paragraphs, allow_abbrev=False)
         self._negative_number_matcher = NEGATIVE_NUMBER
+        for add in arguments:
+            add(self)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Parse as argparse does, after replacing underscores in legged_gym's options by hyphens."""
@@ -54,11 +61,37 @@ class Once(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
-def add_import_argument(parser: argparse.ArgumentParser) -> None:
-    """Add --import, which names user-defined tasks. `args.module` holds its value."""
-    parser.add_argument(
-        "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; several with commas"
-    )
+def argument(*names: str, **options: Any) -> Argument:
+    """Return an argument with the names and options of `add_argument`."""
+    return lambda parser: parser.add_argument(*names, **options)
+
+
+IMPORT = argument(
+    "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; several with commas"
+)
+"""The option --import, which names user-defined tasks. `args.module` holds its value."""
+
+
+def check_number(flag: str, value: float | None, least: float, most: float = math.inf, above: bool = False) -> None:
+    """Check that a number of the command line, if it is given, is from `least`, or `above` it, to `most`.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if value is None or (least < value <= most) or (value == least and not above):
+        return
+    limit = f"at most {most:,}" if value > most else f"above {least:,}" if above else f"at least {least:,}"
+    raise ConfigError(f"{flag}: must be {limit}, got {value:,}")
+
+
+def check_between(flag: str, value: float | None, least: float, most: float, unit: str = "") -> None:
+    """Check that a number of the command line, if it is given, is from `least` to `most`, both in `unit`.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if value is not None and not least <= value <= most:
+        raise ConfigError(f"{flag}: must be between {least:g} and {most:g}{unit and ' '}{unit}, got {value:g}")
 
 
 class Paragraphs(argparse.HelpFormatter):

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from helpers import POLICY, call
 
-from legged.cli import play
-from legged.cli.evaluate import onnx, policy
+from legged.cli.evaluate import RESULT, onnx
+from legged.cli.evaluate import evaluate as policy
+from legged.cli.play import play
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -20,7 +21,7 @@ def test_an_exported_folder_is_measured_as_by_its_own_command(capsys):
     found = []
     for main, name, out in ((policy.main, "exported", "a"), (onnx.main, "exported/policy.onnx", "b")):
         assert call(main, [name, "--out", out]) == 0
-        found.append(json.loads(Path(out, onnx.RESULT).read_text()))
+        found.append(json.loads(Path(out, RESULT).read_text()))
     assert found[0] == found[1]
     assert found[0]["robot"] == "anymal_c"
     (measured,) = found[0]["policies"]

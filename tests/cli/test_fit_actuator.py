@@ -10,7 +10,7 @@ import yaml
 from helpers import call, small_task
 from simulated_motor import TRUTH, simulated_log
 
-from legged.cli import fit_actuator
+from legged.cli.fit_actuator import fit_actuator
 from legged.config import load_config
 from legged.errors import ConfigError
 from legged.fitting.log import check_alike, read_log

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from helpers import HANG_S, POLICY, TASK, kept_global_state, tiny_run
 
-from legged.cli.runs import compare, table
+from legged.cli.runs import compare
+from legged.cli.runs import runs as table
 from legged.evaluation.reports.run_report import write_report
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser: pip install playwright")

@@ -6,7 +6,7 @@ import warnings
 import pytest
 from helpers import call
 
-from legged.cli.runs.evaluations import main
+from legged.cli.runs import evaluations
 from legged.evaluation.reports.comparison import grouped, shares, spread
 
 RULE = {"distance_m": 4.0, "time_s": 20.0, "vx": 0.75}
@@ -33,7 +33,10 @@ def test_seeds_are_averaged_and_their_spread_is_told(tmp_path, capsys):
     evaluation(tmp_path / "b" / "evaluation_mujoco_warp.json", rmse=0.12, stairs={0.1: 0.5, 0.2: 0.7, 0.3: 0.2})
     evaluation(tmp_path / "b" / "evaluation_mujoco.json", physics="mujoco", rmse=0.2, stairs={0.2: 0.25})
     picture = tmp_path / "pictures" / "success.png"
-    assert main([str(tmp_path / "a"), str(tmp_path / "b"), "--types", "stairs_up", "--out", str(picture.parent)]) == 0
+    assert (
+        evaluations.main([str(tmp_path / "a"), str(tmp_path / "b"), "--types", "stairs_up", "--out", str(picture.parent)])
+        == 0
+    )
     said = capsys.readouterr().out
     rows = rows_of(said)
     lines = {row[0]: row[1:] for row in rows}
@@ -49,7 +52,7 @@ def test_seeds_are_averaged_and_their_spread_is_told(tmp_path, capsys):
 
 def test_an_evaluation_that_is_named_twice_is_one_seed(tmp_path, capsys):
     evaluation(tmp_path / "a" / "evaluation_mujoco.json", physics="mujoco")
-    assert main([str(tmp_path / "a"), str(tmp_path / "a" / "evaluation_mujoco.json")]) == 0
+    assert evaluations.main([str(tmp_path / "a"), str(tmp_path / "a" / "evaluation_mujoco.json")]) == 0
     assert "C MuJoCo, 1 seed " in capsys.readouterr().out
 
 
@@ -63,7 +66,7 @@ def test_panels_of_types_that_one_engine_has_not_seen_are_as_wide_as_the_others(
     (tmp_path / "evaluation_mujoco_warp.json").write_text(json.dumps(there))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert main([str(tmp_path), "--out", str(tmp_path)]) == 0
+        assert evaluations.main([str(tmp_path), "--out", str(tmp_path)]) == 0
     assert "written:" in capsys.readouterr().out
 
 
@@ -89,7 +92,7 @@ def test_evaluations_under_other_conditions_are_no_seeds_of_each_other(tmp_path,
     own = evaluation(tmp_path / "1.json", rmse=0.1, stairs={0.2: 0.9})
     other = evaluation(tmp_path / "2.json", rmse=0.3, stairs={0.2: 0.1}) | {"changes": {"terrain.scan": "highest"}}
     (tmp_path / "2.json").write_text(json.dumps(other))
-    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--out", str(tmp_path)]) == 0
+    assert evaluations.main([str(tmp_path / "1.json"), str(tmp_path / "2.json"), "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "terrain.scan=highest" in said
     assert " seeds " not in said.replace("mean of seeds (", "")
@@ -112,7 +115,7 @@ def test_success_of_some_of_the_seeds_says_of_how_many_it_is(tmp_path, capsys):
     (tmp_path / "2.json").write_text(json.dumps(second))
     evaluation(tmp_path / "3.json")
     names = [str(tmp_path / f"{i}.json") for i in (1, 2, 3)]
-    assert main([*names, "--out", str(tmp_path)]) == 0
+    assert evaluations.main([*names, "--out", str(tmp_path)]) == 0
     rows = rows_of(capsys.readouterr().out)
     assert ["stairs_up", "0.1 m", "75.0 (50 to 100, of 2 of 3 seeds)"] in rows
     assert ["pit", "0.1 m", "100.0 (of 1 of 3 seeds)"] in rows
@@ -146,7 +149,7 @@ def test_wrong_input_is_named(arguments, message, tmp_path, monkeypatch, capsys)
     evaluation(tmp_path / "good.json", stairs={0.1: 1.0})
     evaluation(tmp_path / "flat.json")
     (tmp_path / "other.json").write_text("{}", encoding="utf-8")
-    assert call(main, arguments) == 2
+    assert call(evaluations.main, arguments) == 2
     assert message in capsys.readouterr().err
 
 
@@ -184,7 +187,7 @@ POINT = ("success", "types", "pit", "points")
 def test_a_field_of_another_type_is_named(path, value, words, tmp_path, capsys):
     result = evaluation(tmp_path / "x.json", stairs={0.1: 1.0})
     (tmp_path / "x.json").write_text(json.dumps(changed(result, path, value)))
-    assert main([str(tmp_path / "x.json")]) == 2
+    assert evaluations.main([str(tmp_path / "x.json")]) == 2
     err = capsys.readouterr().err
     assert f"x.json: is not the result of an evaluation: {words}" in err
     assert len(err.splitlines()) == 1
@@ -193,7 +196,7 @@ def test_a_field_of_another_type_is_named(path, value, words, tmp_path, capsys):
 @pytest.mark.parametrize("text", ["[1, 2]", "3", "null", "[" * 100_000, "\udcff", "{"])
 def test_a_file_of_something_else_is_named(text, tmp_path, capsys):
     (tmp_path / "x.json").write_bytes(text.encode("utf-8", errors="surrogateescape"))
-    assert main([str(tmp_path / "x.json")]) == 2
+    assert evaluations.main([str(tmp_path / "x.json")]) == 2
     assert "x.json: is not the result of an evaluation" in capsys.readouterr().err
 
 
@@ -202,7 +205,7 @@ def test_who_fell_before_anything_was_measured_has_no_error(tmp_path, capsys):
     for name in ("1", "2"):
         result = evaluation(tmp_path / f"{name}.json", rmse=0.3)
         (tmp_path / f"{name}.json").write_text(json.dumps({**result, "rmse_lin": nothing, "falls": 1.0}))
-    assert main([str(tmp_path / "1.json"), str(tmp_path / "2.json")]) == 0
+    assert evaluations.main([str(tmp_path / "1.json"), str(tmp_path / "2.json")]) == 0
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.split("\n") if "│" in line]
     lines = {row[0]: row[1:] for row in rows}
     assert lines["velocity RMSE, mean [m/s]"] == ["none"]
@@ -217,7 +220,7 @@ def test_a_mean_without_the_seeds_that_fell_says_of_how_many_it_is(tmp_path, cap
         (tmp_path / f"{name}.json").write_text(json.dumps({**result, **changes}))
 
     def told(*names):
-        assert main([str(tmp_path / f"{name}.json") for name in names]) == 0
+        assert evaluations.main([str(tmp_path / f"{name}.json") for name in names]) == 0
         lines = capsys.readouterr().out.split("\n")
         return {line.split("│")[1].strip(): line.split("│")[2].strip() for line in lines if line.count("│") == 3}
 
@@ -230,7 +233,7 @@ def test_a_mean_without_the_seeds_that_fell_says_of_how_many_it_is(tmp_path, cap
 def test_an_engine_of_another_version_and_brackets_in_names_are_shown_as_they_are(tmp_path, capsys):
     evaluation(tmp_path / "1.json", task="[/x]", physics="[red]physx", stairs={0.1: 1.0, 0.2: 0.5})
     out = tmp_path / "new" / "success.png"
-    assert main([str(tmp_path / "1.json"), "--out", str(out.parent)]) == 0
+    assert evaluations.main([str(tmp_path / "1.json"), "--out", str(out.parent)]) == 0
     said = capsys.readouterr().out
     assert "[/x]" in said
     assert "[red]physx, 1 seed" in said
@@ -239,7 +242,7 @@ def test_an_engine_of_another_version_and_brackets_in_names_are_shown_as_they_ar
 
 def test_a_folder_that_is_a_file_is_refused_before_anything_is_read(tmp_path, capsys):
     (tmp_path / "taken").touch()
-    assert main([str(tmp_path / "none"), "--out", str(tmp_path / "taken")]) in (1, 2)
+    assert evaluations.main([str(tmp_path / "none"), "--out", str(tmp_path / "taken")]) in (1, 2)
     err = capsys.readouterr().err
     assert str(tmp_path / "taken") in err
     assert str(tmp_path / "none") not in err

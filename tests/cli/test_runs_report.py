@@ -17,9 +17,10 @@ from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged import registry
-from legged.cli import train
 from legged.cli.evaluate import grid
-from legged.cli.runs import report, table
+from legged.cli.runs import report
+from legged.cli.runs import runs as table
+from legged.cli.train import train
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
 from legged.evaluation.reports import run_report
@@ -249,7 +250,7 @@ def test_a_run_that_is_deleted_before_it_is_filmed_stays_deleted(monkeypatch, ca
         return [np.zeros((32, 32, 3), dtype=np.uint8)]
 
     folder = tiny_run(iterations=1)
-    monkeypatch.setattr(report, "film", film)
+    monkeypatch.setattr("legged.cli.runs.film", film)
     assert report.main([str(folder), "--film"]) == 2
     assert str(folder) in capsys.readouterr().err
     assert not folder.exists()
@@ -273,7 +274,7 @@ def test_without_a_film_there_is_a_report_and_a_line(why, words, monkeypatch, ca
 
 def test_the_command_films(monkeypatch, capsys):
     frames = [np.full((32, 32, 3), shade, dtype=np.uint8) for shade in (0, 90, 180)]
-    monkeypatch.setattr(report, "film", lambda policy, side: frames)
+    monkeypatch.setattr("legged.cli.runs.film", lambda policy, side: frames)
     folder = tiny_run(iterations=1)
     assert report.main([str(folder), "--film"]) == 0
     assert f"written: {folder / 'film.gif'}" in capsys.readouterr().out
@@ -282,7 +283,7 @@ def test_the_command_films(monkeypatch, capsys):
     def fail(policy, side):
         raise RunError("nothing can be rendered here")
 
-    monkeypatch.setattr(report, "film", fail)
+    monkeypatch.setattr("legged.cli.runs.film", fail)
     assert report.main([str(folder), "--film"]) == 0
     assert "no film: nothing can be rendered here\n" in capsys.readouterr().out
 

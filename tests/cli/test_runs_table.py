@@ -11,7 +11,9 @@ import yaml
 from helpers import POLICY, POLICY_ITERATION, TASK, call, tiny_run
 from torch.utils.tensorboard import SummaryWriter
 
-from legged.cli.runs import compare, report, table
+import legged
+from legged.cli.runs import compare, report
+from legged.cli.runs import runs as table
 from legged.config import to_dict
 from legged.evaluation.reports.comparison import apart, comparison_parts
 from legged.evaluation.reports.document import Table
@@ -282,7 +284,7 @@ def test_a_run_is_compared_with_others_only(capsys):
 
 
 def test_the_log_of_this_project_is_one_that_the_tool_writes():
-    page = Path(table.__file__).parents[3] / "docs" / "lab" / "experiments.md"
+    page = Path(legged.__file__).parents[1] / "docs" / "lab" / "experiments.md"
     found = table_in(str(page))
     assert {"began", "task", "what changed", "status", "steps/s"} <= found[0].keys()
     began = [row["began"] for row in found]

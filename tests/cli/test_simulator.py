@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from helpers import CALM, ENGINE, HANG_S, call
 
-from legged.cli import fit_actuator
 from legged.cli.deploy import robot as simulated_robot
 from legged.cli.deploy import sim
+from legged.cli.fit_actuator import fit_actuator
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
 from legged.errors import RunError
@@ -208,7 +208,7 @@ def test_sources_come_every_fifth_state_at_any_time_step():
 def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     policy = [] if flags == ["nobody"] else ["anymal_c_flat"]
-    assert call(sim.main, [*policy, *flags]) == 2
+    assert call(sim.sim.main, [*policy, *flags]) == 2
     shown = capsys.readouterr().err
     assert shown.startswith(says)
     assert len(shown.splitlines()) == 1
@@ -242,7 +242,7 @@ def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys
 
 
 def test_an_unknown_robot_is_not_simulated(capsys):
-    assert call(simulated_robot.main, ["anymal_x"]) == 2
+    assert call(simulated_robot.robot.main, ["anymal_x"]) == 2
     assert "error: ROBOT: there is no robot 'anymal_x'" in capsys.readouterr().err
 
 

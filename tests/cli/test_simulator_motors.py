@@ -154,7 +154,7 @@ def test_the_network_of_the_motors_travels_with_the_policy(tmp_path):
 
 
 def test_the_command_gives_the_robot_what_the_contract_says(contract):
-    args = simulated_robot.build_parser().parse_intermixed_args(["anymal_c", "control.actuator.delay=[4, 4]"])
+    args = simulated_robot.robot.build_parser().parse_intermixed_args(["anymal_c", "control.actuator.delay=[4, 4]"])
     robot, built = simulated_robot.motors_of(args, ROBOT, contract)
     assert built.delay == 10
     simulated = SimulatedRobot(robot, None, SimConfig(dt=0.002), built)
@@ -184,11 +184,11 @@ def test_the_command_gives_the_robot_what_the_contract_says(contract):
 )
 def test_wrong_changes_end_both_commands_with_one_line(changes, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert call(simulated_robot.main, ["anymal_c", *changes]) == 2
+    assert call(simulated_robot.robot.main, ["anymal_c", *changes]) == 2
     shown = capsys.readouterr().err
     assert says in shown
     assert len(shown.splitlines()) == 1
-    assert call(sim.main, ["anymal_c_flat", *changes]) == 2
+    assert call(sim.sim.main, ["anymal_c_flat", *changes]) == 2
     assert says in capsys.readouterr().err
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders
 
-from legged.cli import play, train, watch
+from legged.cli.play import play
+from legged.cli.train import train
+from legged.cli.watch import watch
 from legged.commandline.arguments import watch_command
 from legged.errors import ConfigError
 from legged.play.live.page import HOST, PORT, free_port, is_loopback, url
@@ -39,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("workplace")
     ],
 )
 def test_wrong_input_is_one_line(flags, said, capsys, monkeypatch):
-    monkeypatch.setattr(watch, "load_viser", lambda: None)
+    monkeypatch.setattr("legged.cli.watch.load_viser", lambda: None)
     assert call(watch.main, flags) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1

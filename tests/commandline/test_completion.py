@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from legged.cli.completion import completion
-from legged.cli.listing import tasks
+from legged.cli.list import tasks
 from legged.cli.main import COMMANDS, sub_commands
 
 BASH = """

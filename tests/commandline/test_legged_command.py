@@ -11,8 +11,8 @@ import pytest
 from helpers import TASK, call, forget_modules_of, kept_global_state, run_folders, tiny_run
 
 from legged import registry
-from legged.cli import export, listing
-from legged.cli.evaluate import onnx, policy
+from legged.cli import list as listing
+from legged.cli.export import export
 from legged.cli.main import COMMANDS, load, main, sub_commands
 from legged.commandline.arguments import overrides
 from legged.config import from_dict
@@ -58,7 +58,7 @@ def test_help_of_a_command_shows_two_examples_that_it_can_read(name, capsys):
 def test_every_module_of_the_commands_is_one():
     folder = Path(import_module("legged.cli").__file__).parent
     found = {".".join(("legged.cli", *path.relative_to(folder).with_suffix("").parts)) for path in folder.rglob("*.py")}
-    others = {"main", "__init__", "common"}
+    others = {"main", "__init__"}
     commands = {name for name in found if name.rpartition(".")[2] not in others}
     assert commands == set(MODULES)
 
@@ -181,7 +181,7 @@ def test_a_policy_is_named_in_all_ways(trained, monkeypatch, name, experiment):
     monkeypatch.setattr(registry, "_REGISTERED", {})
     (run,) = Path("logs", TASK).iterdir()
     found = []
-    monkeypatch.setattr(policy, "evaluate_following", lambda one, *_: found.append(one.policy) or 0)
+    monkeypatch.setattr("legged.cli.evaluate.evaluate_following", lambda one, *_: found.append(one.policy) or 0)
     name = name.format(run=f"{TASK}/{run.name}", here=trained)
     assert call(main, ["evaluate", name, "--physics", "mujoco", "--out", str(trained / "out")]) == 0
     (one,) = found
@@ -197,7 +197,9 @@ def test_a_policy_is_named_in_all_ways(trained, monkeypatch, name, experiment):
 def test_an_exported_policy_is_named_by_its_folder_or_its_file(trained, monkeypatch, name):
     monkeypatch.chdir(trained)
     found = []
-    monkeypatch.setattr(onnx, "play", lambda robot, policy, *_: found.append((robot.name, policy.metadata)) or [])
+    monkeypatch.setattr(
+        "legged.cli.evaluate.play", lambda robot, policy, *_: found.append((robot.name, policy.metadata)) or []
+    )
     for words in (["evaluate", name], ["evaluate", "onnx", name]):
         assert call(main, words) == 0
     assert found[0] == found[1]

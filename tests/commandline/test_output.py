@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.commandline.command import Output, forgiving_output, run_main, when_output_is_lost
 from legged.errors import ConfigError, RunError
 

@@ -4,7 +4,7 @@ import pytest
 import yaml
 from helpers import TASK, call, small_config
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.commandline.show import summary
 from legged.config import from_dict, to_yaml
 from legged.registry import task_config

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 from helpers import HANG_S, TASK, TINY_TRAINING, checkpoints, run_folders, wait_for
 
-from legged.cli import train
+import legged
+from legged.cli.train import train
 from legged.commandline.command import SIGNALS, quiet_writers, stopping_on_signals
 from legged.process import startup
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-REPOSITORY = Path(train.__file__).parents[2]
+REPOSITORY = Path(legged.__file__).parents[1]
 
 
 @pytest.mark.parametrize("number", SIGNALS)

@@ -12,9 +12,10 @@ from helpers import TASK, call, kept_global_state, run_folders, tiny_run
 import legged.cli.train
 import legged.policies.restore
 import legged.registry
-from legged.cli import play, train
 from legged.cli.benchmark import step
 from legged.cli.evaluate import grid
+from legged.cli.play import play
+from legged.cli.train import train
 
 SMALLER = (
     'observations.groups.actor.terms=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers

@@ -9,7 +9,7 @@ from helpers import CALM, ENGINE, TASK, TINY_TRAINING, call, checkpoints, run_fo
 from learners import SAMPLES, fill, learner
 from rsl_rl.algorithms import PPO
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars

@@ -7,7 +7,7 @@ import re
 import pytest
 from helpers import call, small_config
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.envs.class_checks import EXTENDED, HOOKS
 from legged.errors import ConfigError

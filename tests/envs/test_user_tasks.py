@@ -8,9 +8,9 @@ import pytest
 from helpers import TASK, call, forget_modules_of, tiny_run
 
 from legged import LeggedRobot, registry, user_modules
-from legged.cli import train
 from legged.cli.episodes import compare
 from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.train import train
 from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.errors import ConfigError

@@ -10,7 +10,7 @@ import pytest
 from handmade import made_by_hand
 from helpers import small_config
 
-from legged.cli.episodes.common import LIST
+from legged.cli.episodes import LIST
 from legged.episodes.joint_statistics import NAME
 from legged.episodes.stored import ABOUT, ARRAYS, CONFIG, TABLE, load_config, load_episodes, save_episodes
 from legged.errors import ConfigError, RunError

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import POLICY, TASK, call, tiny_run
 
-from legged.cli.episodes import compare, record, statistics, stored
+from legged.cli.episodes import compare, list_, record, statistics
 from legged.episodes.stored import ABOUT, ARRAYS
 from legged.errors import RunError
 from legged.policies import restore
@@ -54,10 +54,10 @@ def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monk
     assert (run / "episodes" / ARRAYS).is_file()
     monkeypatch.setattr(restore, "make_task", lambda *_: pytest.fail("simulated"))
     capsys.readouterr()
-    assert call(stored.main, [str(run / "episodes"), "--sort", "torque", "--top", "1"]) == 0
+    assert call(list_.main, [str(run / "episodes"), "--sort", "torque", "--top", "1"]) == 0
     out = capsys.readouterr().out
     assert len(re.findall(r"(?m)^│ +\d+ │", out)) == 1
-    assert call(stored.main, [str(run / "episodes"), "--page", "3"]) == 2
+    assert call(list_.main, [str(run / "episodes"), "--page", "3"]) == 2
     assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
 
 
@@ -106,7 +106,7 @@ def test_other_tasks_show_what_they_have(capsys, monkeypatch):
     assert data["steps"] == 20
     assert len(data["film"].get("pictures") or data["film"]["places"]) == 4
     capsys.readouterr()
-    assert call(stored.main, ["out", "--sort", "tracking"]) == 2
+    assert call(list_.main, ["out", "--sort", "tracking"]) == 2
     assert "--sort: tracking: these episodes have no such figure" in capsys.readouterr().err
 
 
@@ -126,7 +126,7 @@ def test_a_table_of_all_steps_is_written(monkeypatch, capsys):
 
 
 def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
-    monkeypatch.setattr("legged.cli.episodes.common.find_spec", lambda _: None)
+    monkeypatch.setattr("legged.cli.episodes.find_spec", lambda _: None)
     assert call(record.main, [*HERE, "--parquet"]) == 2
     assert capsys.readouterr().err == (
         "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"
@@ -181,9 +181,9 @@ def test_what_cannot_be_is_refused_before_anything_is_built(arguments, words, ca
 @pytest.mark.parametrize(
     ("command", "arguments", "words"),
     [
-        (stored, ["nowhere"], "FOLDER: nowhere holds no episodes.npz"),
-        (stored, ["nowhere", "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
-        (stored, ["nowhere", "--episodes", "3"], "unrecognized arguments: --episodes"),
+        (list_, ["nowhere"], "FOLDER: nowhere holds no episodes.npz"),
+        (list_, ["nowhere", "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
+        (list_, ["nowhere", "--episodes", "3"], "unrecognized arguments: --episodes"),
         (compare, ["a", "b"], "POLICY: there is no task and no run 'a'"),
         (compare, [TASK, "b"], "POLICY: there is no task and no run 'b'"),
         (compare, [TASK, TASK, "--worst", "1"], "unrecognized arguments: --worst"),

@@ -10,9 +10,9 @@ import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
-from legged.cli import play
 from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.evaluate import terrain as evaluate_terrain
+from legged.cli.play import play
 from legged.config import override
 from legged.errors import RunError
 from legged.evaluation import following, result_file

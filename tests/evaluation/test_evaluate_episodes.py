@@ -9,10 +9,11 @@ import pytest
 import torch
 from helpers import call, kept_global_state, run_folders, tiny_run
 
-from legged.cli import play
 from legged.cli.benchmark import ground, step
-from legged.cli.evaluate import checkpoints, episodes, grid, policy
+from legged.cli.evaluate import checkpoints, episodes, grid
+from legged.cli.evaluate import evaluate as policy
 from legged.cli.evaluate import gymnasium as in_gymnasium
+from legged.cli.play import play
 from legged.cli.runs import curves, evaluations
 from legged.cli.terrain import terrain
 from legged.errors import ConfigError
@@ -193,7 +194,7 @@ def test_a_policy_of_the_other_kind_of_task_is_refused(run, command, arguments, 
 
 
 def test_evaluate_measures_what_fits_the_task(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(policy, "ENVIRONMENTS", 3)
+    monkeypatch.setattr("legged.cli.evaluate.ENVIRONMENTS", 3)
     assert call(policy.main, [*SHORT, "--physics", "mujoco", "--out", str(tmp_path)]) == 0
     assert "half_cheetah" in capsys.readouterr().out
     assert json.loads((tmp_path / "evaluation_mujoco.json").read_text())["episodes"]["count"] == 3

@@ -6,7 +6,8 @@ import shutil
 import pytest
 from helpers import POLICY, call
 
-from legged.cli.runs import evaluations, report, table
+from legged.cli.runs import evaluations, report
+from legged.cli.runs import runs as table
 from legged.errors import ConfigError
 from legged.evaluation.result_file import check_result
 

@@ -12,8 +12,8 @@ import torch
 from helpers import POLICY, call, kept_global_state, run_folders, small_config, stand, tiny_run
 
 from legged import make_task
+from legged.cli.evaluate import evaluate
 from legged.cli.evaluate import grid as evaluate_grid
-from legged.cli.evaluate import policy as evaluate
 from legged.cli.evaluate import terrain as evaluate_terrain
 from legged.config import override
 from legged.errors import ConfigError
@@ -284,7 +284,7 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
 def test_evaluate_alone_measures_both_on_the_task_s_own_grid_and_types(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(trained)
     asked = []
-    monkeypatch.setattr(evaluate, "evaluate_following", lambda *given: asked.append(given) or 0)
+    monkeypatch.setattr("legged.cli.evaluate.evaluate_following", lambda *given: asked.append(given) or 0)
     assert call(evaluate.main, ["anymal_c", *HERE, "--out", str(tmp_path / "o")]) == 0
     ((setting, grid, sizes, robots),) = asked
     assert grid.axes["vx"] == [-1.0, -0.5, 0.0, 0.5, 1.0]
@@ -313,7 +313,7 @@ def test_the_other_engine_is_drawn_too_if_it_is_of_the_same_checkpoint(tmp_path)
 @pytest.mark.slow
 def test_a_plane_task_is_evaluated_as_ever_and_crosses_terrain_only_if_asked(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(success, "TIME_S", 0.1)
-    monkeypatch.setattr("legged.cli.evaluate.common.ROBOTS", 1)
+    monkeypatch.setattr("legged.cli.evaluate.ROBOTS", 1)
     arguments = [str(POLICY), *HERE, *(f"evaluation.{axis}=[0,0,1]" for axis in ("vx", "vy", "yaw"))]
     shipped = json.loads((POLICY / "evaluation_mujoco.json").read_text())
     assert call(evaluate.main, [*arguments, "--out", str(tmp_path / "plane")]) == 0

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
-from legged.cli import play, train
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from outcomes import refused_in_a_line
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.config import from_dict, load_config, to_yaml
 from legged.config.loader import parse_override
 from legged.learning.runner import Runner

@@ -10,7 +10,8 @@ from helpers import TASK, checkpoints, run_folders
 from hypothesis import given
 from hypothesis import strategies as st
 
-from legged.cli import play, train
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.learning.run_folder import run_config
 
 pytestmark = pytest.mark.slow

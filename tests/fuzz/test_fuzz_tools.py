@@ -11,12 +11,14 @@ from helpers import TASK, TINY_TRAINING
 from hypothesis import given
 from hypothesis import strategies as st
 
-from legged.cli import play, train
 from legged.cli.benchmark import step
 from legged.cli.evaluate import checkpoints, grid
 from legged.cli.evaluate import terrain as success
-from legged.cli.runs import compare, curves, evaluations, report, table
+from legged.cli.play import play
+from legged.cli.runs import compare, curves, evaluations, report
+from legged.cli.runs import runs as table
 from legged.cli.terrain import terrain
+from legged.cli.train import train
 from legged.process.paths import data_folder
 from legged.registry import _REGISTERED
 

@@ -13,7 +13,7 @@ from devices import CUDA
 from helpers import CALM, TASK, checkpoints, run_folders
 from tensordict import TensorDict
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.evaluation.learning_curves import read_scalars
 from legged.graph.step_graph import StepGraph

@@ -8,9 +8,10 @@ import pytest
 import torch
 from helpers import TASK, call, checkpoints, kept_global_state, tiny_run
 
-from legged.cli import play, train
 from legged.cli.evaluate import checkpoints as evaluate_checkpoints
 from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.checkpoint import FORMAT, read_checkpoint
 from legged.learning.run_folder import shipped_policy

@@ -6,7 +6,7 @@ from helpers import TASK, TINY_TRAINING, call, tiny_run
 from learners import fill, learner
 from test_resume import content, same
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import BaseTask
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint

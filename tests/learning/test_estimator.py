@@ -15,7 +15,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from test_resume import content, same
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import read_scalars
 from legged.evaluation.velocity_grid import Grid

@@ -10,8 +10,8 @@ from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_c
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import nn
 
-from legged.cli import train
 from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.train import train
 from legged.config.schema import RunnerConfig
 from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint

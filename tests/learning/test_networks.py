@@ -10,8 +10,9 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, small_config, small_task, tiny_run
 from tensordict import TensorDict
 
-from legged.cli import play, train
 from legged.cli.evaluate import grid as evaluate_grid
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint

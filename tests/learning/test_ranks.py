@@ -15,7 +15,8 @@ import pytest
 import torch
 from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, small_task
 
-from legged.cli import train
+import legged
+from legged.cli.train import train
 from legged.commandline.arguments import pick_device
 from legged.errors import ConfigError
 from legged.process.ranks import Ranks
@@ -23,7 +24,7 @@ from legged.registry import make_task, task_config
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-REPOSITORY = Path(train.__file__).parents[2]
+REPOSITORY = Path(legged.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
 TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
 
@@ -31,7 +32,7 @@ TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAININ
 SPY = """
 import sys, torch
 from legged.process.ranks import Ranks
-from legged.cli import train
+from legged.cli.train import train
 from legged.learning.runner import Runner
 learn = Runner.train
 
@@ -303,7 +304,7 @@ def test_a_rank_beyond_the_number_of_processes_is_named(monkeypatch):
 def test_a_number_of_processes_that_was_left_behind_is_named_before_anything_is_built(monkeypatch, capsys):
     as_rank(monkeypatch, 0, 2)
     monkeypatch.delenv("MASTER_ADDR", raising=False)
-    monkeypatch.setattr(train, "make_task", lambda *_, **__: pytest.fail("built"))
+    monkeypatch.setattr("legged.cli.train.make_task", lambda *_, **__: pytest.fail("built"))
     assert call(train.main, ["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 2
     err = capsys.readouterr().err
     assert "error: WORLD_SIZE: the environment says that 2 processes train together" in err

@@ -10,7 +10,8 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, checkpoints, run_folders, small_config, small_task, tiny_run
 
 import legged.policies.export as export_module
-from legged.cli import play, train
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.recurrent import rnn_of

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import TASK, call, run_folders, tiny_run
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.learning.run_folder import run_config
 from legged.policies.restore import policy_of  # noqa: F401  (imports every loader of checkpoints)

@@ -11,7 +11,7 @@ import torch
 from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_run
 
 import legged.cli.train
-from legged.cli import train
+from legged.cli.train import train
 from legged.errors import ConfigError, RunError
 from legged.learning import run_folder as runs
 from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config

@@ -8,7 +8,8 @@ import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, tiny_run
 from test_resume import EVENTFUL, content, same
 
-from legged.cli import play, train
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.config import to_dict
 from legged.envs.checks import check_lengths
 from legged.errors import ConfigError

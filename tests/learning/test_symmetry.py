@@ -9,7 +9,7 @@ from helpers import call, small_config, small_task, tiny_run
 from reference import States, random_states
 from tensordict import TensorDict
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner

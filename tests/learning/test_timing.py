@@ -5,7 +5,7 @@ import json
 import pytest
 from helpers import TASK, TINY_TRAINING, run_folders, small_task, tiny_run
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.timing import TIMING_FILE, Timing, read_timing, write_timing
 from legged.physics.warp import mujoco_warp

@@ -11,7 +11,7 @@ from rsl_rl.utils import wandb_log_writer
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import legged.cli.train
-from legged.cli import train
+from legged.cli.train import train
 from legged.learning.checkpoint import read_checkpoint
 
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -1,6 +1,5 @@
 """Training from the command line: what a run leaves behind, how it goes on, and how it stops."""
 
-import argparse
 import contextlib
 import os
 import re
@@ -15,16 +14,18 @@ import torch
 import yaml
 from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run, wait_for
 
-from legged.cli import train
-from legged.commandline.arguments import add_policy_arguments, policy_overrides
+import legged
+from legged.cli.train import train
+from legged.commandline.arguments import POLICY, policy_overrides
 from legged.config import from_dict
 from legged.config.loader import read_yaml
 from legged.learning.run_folder import find_run, run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import policy_of
+from legged.process.command_parser import CommandParser
 from legged.registry import make_task, task_config
 
-REPOSITORY = Path(train.__file__).parents[2]
+REPOSITORY = Path(legged.__file__).parents[1]
 UPDATES = 20  # optimiser steps per iteration: 5 epochs of 4 mini-batches
 SIZES = ["train.policy.actor_hidden_dims=[8]", "train.policy.critic_hidden_dims=[8]"]
 
@@ -107,7 +108,7 @@ def test_a_fixed_seed_trains_to_the_same_network():
 
 
 def test_show_prints_yaml_that_loads_back_and_builds_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(train, "make_task", lambda *_: pytest.fail("built"))
+    monkeypatch.setattr("legged.cli.train.make_task", lambda *_: pytest.fail("built"))
     arguments = ["--task", TASK, "--sim_device", "cpu", "--show", "--num_envs", "9", "rewards.scales.torques=-1e-6"]
     assert train.main(arguments) == 0
     shown = from_dict(yaml.safe_load(capsys.readouterr().out))
@@ -225,8 +226,7 @@ def test_the_newest_run_is_the_one_trained_last_not_the_one_looked_at_last():
 @pytest.mark.parametrize("name", ["walking", "walking/{run}", "logs/walking/{run}"])
 def test_a_policy_is_found_by_the_arguments_that_commands_share(name):
     folder = tiny_run("--experiment_name", "walking", "train.runner.save_interval=1")
-    parser = argparse.ArgumentParser()
-    add_policy_arguments(parser)
+    parser = CommandParser("x", "Do.", "x a", "x b", arguments=POLICY)
     args = parser.parse_intermixed_args([name.format(run=folder.name), "--checkpoint", "0", "env.seed=3"])
     assert policy_overrides(args) == [("env.seed", 3)]
     policy = policy_of(args.policy, args.checkpoint)

@@ -9,7 +9,8 @@ import torch
 from helpers import POLICY, POLICY_ITERATION, TASK, TINY_TRAINING, call, checkpoints, run_folders, tiny_run
 
 import legged
-from legged.cli import play, train
+from legged.cli.play import play
+from legged.cli.train import train
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import run_config
@@ -219,7 +220,7 @@ DIFFERENT = {
 @pytest.mark.parametrize("change", DIFFERENT)
 def test_what_differs_is_named_before_anything_is_built(capsys, monkeypatch, change):
     source = tiny_run()
-    monkeypatch.setattr(train, "make_task", lambda *_, **__: pytest.fail("built"))
+    monkeypatch.setattr("legged.cli.train.make_task", lambda *_, **__: pytest.fail("built"))
     override, text = DIFFERENT[change]
     error = refused(capsys, "--transfer", str(source), override)
     assert re.search(rf"{source}/model_1\.pt: .*{text}", error), error

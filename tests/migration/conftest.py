@@ -5,7 +5,7 @@ from forks import Result, written
 from helpers import call
 
 from legged import registry
-from legged.cli import migrate
+from legged.cli.migrate import migrate
 
 
 @pytest.fixture

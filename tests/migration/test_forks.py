@@ -10,7 +10,7 @@ from helpers import call
 from importing_fixtures import urdf
 
 from legged.cli import main as legged
-from legged.cli import migrate
+from legged.cli.migrate import migrate
 from legged.config.yaml_files import read_yaml
 from legged.migration import reading
 

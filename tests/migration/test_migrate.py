@@ -7,7 +7,8 @@ import pytest
 from forks import ANYMAL_FLAT, BASE, FLAT, GO2, MIXINS, OUR_BASE, REGISTERED, TWO, built, line_of, written
 from helpers import call
 
-from legged.cli import migrate, train
+from legged.cli.migrate import migrate
+from legged.cli.train import train
 from legged.config import from_dict
 from legged.config.schema import STATE_TERMS
 from legged.config.yaml_files import read_yaml

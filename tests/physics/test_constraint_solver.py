@@ -12,7 +12,7 @@ from devices import on_gpu
 from helpers import call
 from reference import heaps, random_states, roll
 
-from legged.cli.train import main
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.physics.fused.constraint_solver import ConstraintSolver
 
@@ -179,7 +179,7 @@ def test_what_a_robot_has_not_is_left_out_of_its_kernel(make_physics):
 
 def test_a_wrong_name_says_which_are_right(capsys):
     arguments = ["--task", "anymal_c_flat", "sim.step=fuse", "--show"]
-    assert call(main, arguments) == 2
+    assert call(train.main, arguments) == 2
     text = capsys.readouterr().err
     assert "sim.step" in text
     assert "fused" in text

@@ -27,7 +27,7 @@ def ends(code: str, folder: Path, missing: tuple[str, ...], **environment: str) 
 
 
 def test_playing_without_a_film_needs_neither_encoder_nor_windows(tmp_path):
-    code = f"sys.argv = {[PLAY, '--no-video', *ARGUMENTS]!r}\nfrom legged.cli.play import main\nsys.exit(main())"
+    code = f"sys.argv = {[PLAY, '--no-video', *ARGUMENTS]!r}\nfrom legged.cli.play import play\nsys.exit(play.main())"
     done = ends(code, tmp_path, ("imageio_ffmpeg", "imageio", "glfw", "mujoco.viewer"))
     assert (done.returncode, done.stderr) == (0, "")
     assert "following commands" in done.stdout
@@ -45,8 +45,8 @@ def test_a_film_without_an_encoder_is_one_line_after_the_table_and_a_gif_is_ther
         "    def close(self): ...\n"
         "films.camera_of = Camera\n"
         "demonstrations.SCHEDULE = ((0.2, (0.5, 0.0, 0.0)),)\n"
-        "from legged.cli.play import main\n"
-        f"sys.exit(main({['--headless', '--gif', *ARGUMENTS]!r}))"
+        "from legged.cli.play import play\n"
+        f"sys.exit(play.main({['--headless', '--gif', *ARGUMENTS]!r}))"
     )
     done = ends(code, tmp_path, ("imageio_ffmpeg",))
     assert done.returncode == 1

@@ -9,7 +9,7 @@ import pytest
 from helpers import POLICY, TASK, call, small_config, small_task, stand
 
 import legged.policies.restore
-from legged.cli import play
+from legged.cli.play import play
 from legged.envs import LeggedRobot
 from legged.errors import RunError
 from legged.play import demonstrations, films
@@ -108,9 +108,9 @@ def test_where_nothing_can_be_drawn_commands_are_followed_all_the_same(short, mo
 
 @pytest.mark.slow
 def test_a_window_that_does_not_open_is_told_and_a_film_is_made(short, monkeypatch, capsys):
-    monkeypatch.setattr(play, "HEADLESS", False)
-    monkeypatch.setattr(play, "window_opens", lambda: False)
-    monkeypatch.setattr(play, "view", lambda *_: pytest.fail("opened"))
+    monkeypatch.setattr("legged.cli.play.HEADLESS", False)
+    monkeypatch.setattr("legged.cli.play.window_opens", lambda: False)
+    monkeypatch.setattr("legged.cli.play.view", lambda *_: pytest.fail("opened"))
     assert call(play.main, [*HERE, "--num_envs", "1", "--out", "out"]) == 0
     assert "no window opens on this display: recording only" in capsys.readouterr().out
     assert Path("out/play.mp4").is_file()

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, call, kept_global_state, tiny_run
 
-from legged.cli import play
+from legged.cli.play import play
 from legged.config import TaskConfig, override
 from legged.envs import LeggedRobot
 from legged.math import yaw_of
@@ -267,7 +267,9 @@ def arguments(run: Path, out: Path, *more: str) -> list[str]:
 @pytest.mark.slow
 def test_play_on_the_types_of_the_task(run, short, tmp_path, capsys, monkeypatch):
     tasks = []
-    monkeypatch.setattr(play, "walk_out", lambda task, *rest: tasks.append(task) or demonstrations.walk_out(task, *rest))
+    monkeypatch.setattr(
+        "legged.cli.play.walk_out", lambda task, *rest: tasks.append(task) or demonstrations.walk_out(task, *rest)
+    )
     assert call(play.main, arguments(run, tmp_path, "--no-video", "--difficulty", "0.5")) == 0
     out = capsys.readouterr().out
     assert (tmp_path / "exported" / "policy.onnx").is_file()

@@ -9,7 +9,7 @@ import torch
 from helpers import CALM, ENGINE, call, small_config, small_task, tiny_run
 
 from legged import unit
-from legged.cli import export as export_tool
+from legged.cli.export import export as export_tool
 from legged.config.schema import ObservationGroupConfig
 from legged.envs import LeggedRobot
 from legged.learning.runner import Runner

@@ -11,8 +11,8 @@ import torch
 from helpers import TINY_TRAINING, call, run_folders, small_task
 
 import legged.policies.export as export_module
-from legged.cli import export as export_tool
-from legged.cli import train
+from legged.cli.export import export as export_tool
+from legged.cli.train import train
 from legged.learning.runner import Runner
 from legged.policies.export import ExportError, export
 

@@ -9,7 +9,7 @@ import pytest
 from helpers import call
 from onnx import TensorProto, helper, numpy_helper
 
-from legged.cli.evaluate.onnx import main
+from legged.cli.evaluate import onnx as command
 from legged.errors import ConfigError
 from legged.evaluation.playback import play
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout
@@ -130,7 +130,7 @@ def test_a_policy_that_does_nothing_stands_or_topples(policy_file):
 def test_the_command(policy_file, capsys):
     path = policy_file(np.zeros((WIDTH, 12)), np.zeros(12))
     arguments = [str(path), "--robot", "anymal_c", "--layout", "holosoma", "--seconds", "2.5", "--command", "0.5,0,0"]
-    assert call(main, arguments) == 0
+    assert call(command.main, arguments) == 0
     text = capsys.readouterr().out
     assert "0.50   0.00   0.00" in text
     assert "1.00   0.00   0.00" not in text
@@ -165,7 +165,7 @@ def test_wrong_input_ends_with_one_line(policy_file, tmp_path, capsys, arguments
     broken = tmp_path / "broken.onnx"
     broken.write_text("not a network")
     path = policy_file(np.zeros((WIDTH, 12)), np.zeros(12))
-    assert call(main, [text.format(policy=path, other=other, broken=broken) for text in arguments]) == 2
+    assert call(command.main, [text.format(policy=path, other=other, broken=broken) for text in arguments]) == 2
     error = capsys.readouterr().err.strip()
     assert error.startswith("error: ")
     assert message in error

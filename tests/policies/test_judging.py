@@ -10,9 +10,9 @@ import torch
 from helpers import call, small_task, tiny_run
 from onnx import TensorProto, helper, numpy_helper
 
-from legged.cli import export
+from legged.cli.evaluate import evaluate
 from legged.cli.evaluate import onnx as evaluate_onnx
-from legged.cli.evaluate import policy as evaluate
+from legged.cli.export import export
 from legged.errors import ConfigError
 from legged.evaluation.playback import Stage, follow
 from legged.evaluation.velocity_grid import Grid

@@ -125,8 +125,8 @@ WITHOUT_OPENGL = """
 import sys
 sys.modules["OpenGL"] = None
 sys.argv = {argv!r}
-from legged.cli.{command} import main
-sys.exit(main())
+from legged.cli.{command} import {command}
+sys.exit({command}.main())
 """
 TOP = Path(legged.__file__).parents[1]
 

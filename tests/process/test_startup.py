@@ -33,7 +33,7 @@ def test_the_collector_is_as_it_was_after_imports_even_failed_ones(enabled):
 def test_only_a_command_keeps_what_it_imported_from_the_collector():
     code = (
         "import gc, sys\n"
-        "from legged.cli import train\n"
+        "from legged.cli.train import train\n"
         "print(gc.isenabled(), gc.get_freeze_count() > 0)\n"
         "train.main(['--task', 'none'])\n"
         "print(gc.isenabled(), gc.get_freeze_count() > 0)\n"

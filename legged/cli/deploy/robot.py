@@ -1,9 +1,4 @@
-"""Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
-
-C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
-packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT` runs a
-policy on it.
-"""
+"""`legged deploy robot`: a simulated robot behind UDP."""
 
 import argparse
 import json
@@ -11,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from legged.commandline.command import command
+from legged.commandline.command import sub_command
 from legged.config import parse_override
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError
 from legged.mdp.actuator import with_rotors
-from legged.process.command_parser import CommandParser
+from legged.process.command_parser import argument, check_between
 from legged.process.paths import make_folder, ready_to_write, replacing, write_text
 from legged.robots.robot import Robot, load_robot
 from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
@@ -35,40 +30,56 @@ BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged deploy robot",
-        __doc__,
-        "legged deploy robot anymal_c",
-        "legged deploy robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
-        "legged deploy robot go2 control.actuator.model=dc_motor 'control.actuator.delay=[5, 10]'",
-    )
-    parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or its folder")
-    add_simulation_arguments(parser)
-    trained = "policy.json whose motors and map the robot has; ideal motors without one"
-    parser.add_argument("--contract", type=Path, help=trained)
-    out = f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute"
-    parser.add_argument("--out", type=Path, help=out)
-    parser.add_argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600")
-    return parser
+SIMULATION = (
+    argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default"),
+    argument("--size", type=float, help="size of the tile, in the unit of its type, e.g. the height of a step [m]"),
+    argument("--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are whole cells; default 0.1"),
+    argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002"),
+    argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0"),
+    argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0"),
+    argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1"),
+    argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with"),
+    argument(
+        "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
+    ),
+)
+"""Arguments of the simulation."""
 
 
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+@sub_command(
+    "legged deploy robot anymal_c",
+    "legged deploy robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+    "legged deploy robot go2 control.actuator.model=dc_motor 'control.actuator.delay=[5, 10]'",
+    arguments=(
+        argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
+        *SIMULATION,
+        argument("--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"),
+        argument(
+            "--out",
+            type=Path,
+            help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute",
+        ),
+        argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600"),
+    ),
+)
+def robot(args: argparse.Namespace) -> int:
+    """Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
+
+    C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
+    packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT`
+    runs a policy on it.
+    """
     check_simulation(args)
     if not args.seconds > 0.0:
         raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
     if args.out is not None:
         ready_to_write(args.out)
         make_folder(args.out)
-    robot = load_robot(args.robot, "ROBOT")
+    loaded = load_robot(args.robot, "ROBOT")
     sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
     contract = None if args.contract is None else read_contract(args.contract)
-    (robot, motors), scan = motors_of(args, robot, contract), scan_of(contract)
-    server = Server(SimulatedRobot(robot, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
+    (rotored, motors), scan = motors_of(args, loaded, contract), scan_of(contract)
+    server = Server(SimulatedRobot(rotored, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
     take_priority(PRIORITY)  # motors and sensors of a real robot do not wait for other processes either
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
@@ -78,26 +89,6 @@ def main(argv: list[str] | None) -> int:
         write_text(args.out / REPORT, json.dumps(report, indent=1))
     print(json.dumps(report), flush=True)
     return 0
-
-
-def add_simulation_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of the simulation."""
-    parser.add_argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default")
-    parser.add_argument("--size", type=float, help="size of the tile, in the unit of its type, e.g. the height of a step [m]")
-    parser.add_argument(
-        "--cell",
-        type=float,
-        default=0.1,
-        help="edge of the tile's cells [m]; treads are whole cells; default 0.1",
-    )
-    parser.add_argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002")
-    parser.add_argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0")
-    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1")
-    parser.add_argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with")
-    parser.add_argument(
-        "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
-    )
 
 
 def check_simulation(args: argparse.Namespace) -> None:
@@ -111,15 +102,11 @@ def check_simulation(args: argparse.Namespace) -> None:
         largest = terrain_type(args.terrain, "--terrain").largest
     elif args.size is not None:
         raise ConfigError("--size: a plane has no size; name a type of tiles with --terrain")
-    for flag, value, low, high in (
-        ("--size", args.size, 0.0, largest),
-        ("--cell", args.cell, 0.02, 1.0),
-        ("--sim-dt", args.sim_dt, 1e-4, 0.02),
-        ("--latency", args.latency, 0.0, 1.0),
-        ("--loss", args.loss, 0.0, 0.9),
-    ):
-        if value is not None and not low <= value <= high:
-            raise ConfigError(f"{flag}: must be between {low:g} and {high:g}, got {value:g}")
+    check_between("--size", args.size, 0.0, largest)
+    check_between("--cell", args.cell, 0.02, 1.0)
+    check_between("--sim-dt", args.sim_dt, 1e-4, 0.02)
+    check_between("--latency", args.latency, 0.0, 1.0)
+    check_between("--loss", args.loss, 0.0, 0.9)
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:

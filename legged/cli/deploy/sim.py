@@ -1,8 +1,4 @@
-"""Run the robot's program against a simulated robot: `legged deploy sim anymal_c_proprio`.
-
-The command exports the policy if necessary. It starts the simulated robot in one process and the program of the real robot
-(`python -m legged.deploy`) in another one; they talk over UDP. At the end it prints how far the robot got.
-"""
+"""`legged deploy sim`: the robot's program against a simulated robot."""
 
 import argparse
 import json
@@ -15,29 +11,20 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.cli.deploy.robot import (
-    LISTENING,
-    POSES,
-    REPORT,
-    add_simulation_arguments,
-    check_simulation,
-    motors_of,
-    terrain_of,
-)
-from legged.commandline.arguments import POLICY_HELP
-from legged.commandline.command import EXIT_WRONG_INPUT, command
+from legged.cli.deploy.robot import LISTENING, POSES, REPORT, SIMULATION, check_simulation, motors_of, terrain_of
+from legged.commandline.arguments import POLICY_HELP, import_given
+from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
 from legged.config import LeggedConfig
-from legged.deploy.__main__ import add_program_arguments, limits_of
+from legged.deploy.__main__ import PROGRAM, limits_of
 from legged.deploy.contract import Contract, read_contract
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
 from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import CommandParser, add_import_argument
+from legged.process.command_parser import IMPORT, argument
 from legged.process.paths import exists, ready_to_write, relative
 from legged.process.startup import INTERRUPTED, in_main_thread
-from legged.registry import import_tasks
 from legged.rendering.camera import Camera, Follower, caption, size_of
 from legged.rendering.scene import display_model
 from legged.robots.robot import Robot, load_robot
@@ -58,35 +45,31 @@ SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser(
-        "legged deploy sim",
-        __doc__,
-        "legged deploy sim anymal_c_proprio",
-        "legged deploy sim anymal_c_proprio --terrain stairs_up --size 0.17 --film",
-        "legged deploy sim anymal_c_proprio 'control.actuator.delay=[4, 4]'",
-    )
-    parser.add_argument("policy", metavar="POLICY", help=f"an exported folder or its ONNX file, {POLICY_HELP}")
-    add_import_argument(parser)
-    parser.add_argument("--robot", metavar="ROBOT", help="name or folder of the robot; the policy's by default")
-    add_simulation_arguments(parser)
-    add_program_arguments(parser)
-    parser.add_argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default")
-    parser.add_argument("--film", action="store_true", help="draw the first half minute as film.mp4")
-    return parser
+@sub_command(
+    "legged deploy sim anymal_c_proprio",
+    "legged deploy sim anymal_c_proprio --terrain stairs_up --size 0.17 --film",
+    "legged deploy sim anymal_c_proprio 'control.actuator.delay=[4, 4]'",
+    arguments=(
+        argument("policy", metavar="POLICY", help=f"an exported folder or its ONNX file, {POLICY_HELP}"),
+        IMPORT,
+        argument("--robot", metavar="ROBOT", help="name or folder of the robot; the policy's by default"),
+        *SIMULATION,
+        *PROGRAM,
+        argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default"),
+        argument("--film", action="store_true", help="draw the first half minute as film.mp4"),
+    ),
+)
+def sim(args: argparse.Namespace) -> int:
+    """Run the robot's program against a simulated robot: `legged deploy sim anymal_c_proprio`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    args = build_parser().parse_intermixed_args(argv)
+    The command exports the policy if necessary. It starts the simulated robot in one process and the program of the real
+    robot (`python -m legged.deploy`) in another one; they talk over UDP. At the end it prints how far the robot got.
+    """
     limits_of(args)
     check_simulation(args)
     if args.commands is not None and not exists(args.commands):
         raise ConfigError(f"--commands: there is no file {args.commands}")
-    if args.module:
-        import_tasks(args.module)
+    import_given(args)
     exported = _exported(args.policy)
     contract = read_contract(exported / "policy.json")
     robot = _simulated(args.robot, exported, contract)

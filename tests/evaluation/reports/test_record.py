@@ -12,7 +12,8 @@ import pytest
 import yaml
 from helpers import TASK, TINY_TRAINING, checkpoints, run_folders, tiny_run, wait_for
 
-from legged.cli import train
+import legged
+from legged.cli.train import train
 from legged.config import to_dict
 from legged.config.dotted import MISSING
 from legged.errors import ConfigError
@@ -23,7 +24,7 @@ from legged.registry import task_config
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-REPOSITORY = Path(train.__file__).parents[2]
+REPOSITORY = Path(legged.__file__).parents[1]
 FLAGS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING, "train.runner.save_interval=1"]
 
 

@@ -1,31 +1,30 @@
-"""Tasks and robots of this installation: `legged list`.
+"""`legged list`: tasks and robots of this installation."""
 
-The lists are read from the files' comments, which is fast.
-"""
-
+import argparse
 from itertools import takewhile
 from pathlib import Path
 
 from legged.cli.main import print_rows
-from legged.commandline.command import command
-from legged.process.command_parser import CommandParser
+from legged.commandline.command import sub_command
+from legged.process.command_parser import argument
 from legged.process.paths import data_folder
 
 
-def build_parser() -> CommandParser:
-    """Return the parser of the command line."""
-    parser = CommandParser("legged list", __doc__, "legged list", "legged list robots")
-    parser.add_argument("what", nargs="?", choices=("tasks", "robots"), help="one of the two lists; both by default")
-    return parser
+@sub_command(
+    "legged list",
+    "legged list robots",
+    arguments=[
+        argument("what", nargs="?", choices=("tasks", "robots"), help="one of the two lists; both by default"),
+    ],
+)
+def list_(args: argparse.Namespace) -> int:
+    """List tasks and robots of this installation: `legged list`.
 
-
-@command
-def main(argv: list[str] | None) -> int:
-    """Run the command; return its exit code."""
-    what = build_parser().parse_args(argv).what
-    if what != "robots":
+    The lists are read from the files' comments, which is fast.
+    """
+    if args.what != "robots":
         print_rows("tasks, each for `legged train TASK`", tasks())
-    if what != "tasks":
+    if args.what != "tasks":
         print_rows("robots, each for `robot: NAME` in a task's file", robots())
     return 0
 

@@ -1,0 +1,247 @@
+"""`legged runs`: tables and pages about runs and evaluations."""
+
+import argparse
+import faulthandler
+from pathlib import Path
+
+import torch
+from rich.console import Console
+
+from legged.cli.main import hint_at_sub_command
+from legged.commandline.arguments import CHECKPOINT, import_given
+from legged.commandline.command import sub_command
+from legged.config import LeggedConfig
+from legged.errors import ConfigError, RunError
+from legged.evaluation.learning_curves import Log, common_time, labels, levels, outcomes, read_config, read_scalars
+from legged.evaluation.reports.charts import draw_charts
+from legged.evaluation.reports.comparison import (
+    Evaluations,
+    comparison_parts,
+    draw_comparison,
+    episodes_comparison,
+    grouped,
+    keep_types,
+    success_table,
+    tracking_table,
+)
+from legged.evaluation.reports.document import to_html, to_markdown, write_pages
+from legged.evaluation.reports.experiments import TITLE, experiments_parts
+from legged.evaluation.reports.record import FILMS, folders_in, read_record
+from legged.evaluation.reports.run_report import command_on, write_report
+from legged.evaluation.result_file import has_tracking, read_results
+from legged.evaluation.success import types_in
+from legged.learning.run_folder import CONFIG_FILE, LOGS, NOTE_FILE, find_checkpoint, own_run, run_config
+from legged.play.films import film, write_film
+from legged.policies.restore import TrainedPolicy
+from legged.process.command_parser import IMPORT, argument
+from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
+from legged.process.startup import command_of_ours
+
+SIDE = 320
+"""Width and height of the film [pixels]."""
+LONGEST_FILM_S = 900.0
+"""Time limit for filming, after which the process is ended because it hangs [s]."""
+LONGEST_NOTE = 1000
+MOST_COMPARED = 8
+"""Largest number of runs that are compared, which is the number of colours."""
+PICTURE = "learning_curve.png"
+RUNS = (argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or tasks, whose newest runs count"), IMPORT)
+"""The positional argument RUN, of one or more runs, and --import."""
+
+
+def _folders_of(args: argparse.Namespace) -> list[Path]:
+    """Return the folders of the runs on a command line, after the import of its user-defined tasks.
+
+    Raises:
+        ConfigError: there is no such run or module.
+    """
+    import_given(args)
+    return [own_run(name, "RUN") for name in args.runs]
+
+
+@sub_command(
+    "legged runs",
+    "legged runs logs/anymal_c_flat logs/go2_flat --seeds-share",
+    arguments=(
+        argument("folders", nargs="*", type=Path, metavar="FOLDER", help=f"folders of runs; {LOGS}/ by default"),
+        argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; {LOGS}/, or the first one given"),
+        argument("--seeds-share", action="store_true", help="one row of means for runs that differ in their seed only"),
+        IMPORT,
+    ),
+)
+def runs(args: argparse.Namespace) -> int:
+    """List all runs in one table: `legged runs`.
+
+    Every run in logs/, or in the folders given, becomes a row of experiments.html and experiments.md, newest first. On the
+    page a click on a column sorts and a field filters. `--seeds-share` makes one row of the seeds of a training.
+    """
+    import_given(args)
+    folder: Path = args.out or (args.folders[0] if args.folders else LOGS)
+    if exists(folder) or args.out is not None:  # `folders_in` reports a missing folder of runs
+        ready_to_write(folder, 4.0)
+    with hint_at_sub_command("runs", list(map(str, args.folders))):
+        found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}
+    records = [read_record(run) for run in found.values()]
+    make_folder(folder)
+    parts = {ending: experiments_parts(records, folder, ending, args.seeds_share) for ending in ("md", "html")}
+    write_text(folder / "experiments.md", to_markdown(TITLE, parts["md"], "experiments"))
+    page = folder / "experiments.html"
+    write_text(page, to_html(TITLE, parts["html"]))
+    print(f"written: {relative(page)}, {len(records)} runs")
+    return 0
+
+
+@sub_command(
+    "legged runs report anymal_c_flat/2026-11-22_05-38-19",
+    "legged runs report anymal_c_flat --film",
+    arguments=(
+        *RUNS,
+        CHECKPOINT,
+        argument("--film", action="store_true", help=f"film the policy again, into {FILMS[0]}"),
+        argument("--note", help=f"a sentence about the run, kept in its {NOTE_FILE}"),
+    ),
+)
+def report(args: argparse.Namespace) -> int:
+    """Write a page about a run: `legged runs report anymal_c_flat`.
+
+    report.html is written into the run's folder: settings, curves, evaluations and the film on one page that needs no
+    network. report.md and its pictures lie beside it. A training writes its report when it ends; this command writes it
+    again, after an evaluation or for a run that was killed. `--film` films the policy first; `--note` keeps a sentence about
+    the run.
+    """
+    if args.checkpoint is not None and not args.film:
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
+    folders = _folders_of(args)
+    note = " ".join((args.note or "").split())
+    if args.note is not None and not 0 < len(note) <= LONGEST_NOTE:
+        raise ConfigError(f"--note: expected a sentence of at most {LONGEST_NOTE} letters, got {len(note)}")
+    for folder in folders if note else ():
+        write_text(folder / NOTE_FILE, f"{note}\n")
+    for folder in folders:
+        ready_to_write(folder, 4.0)
+        if args.film:
+            if command_of_ours():  # a drawing library may hang where exceptions do not reach it
+                faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
+            why = _film(folder, args.checkpoint)
+            faulthandler.cancel_dump_traceback_later()
+            print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
+        print(f"written: {relative(write_report(folder))}", flush=True)
+    return 0
+
+
+def _film(folder: Path, checkpoint: int | str | None) -> str:
+    """Film the policy of a run; return the reason if that is impossible, else an empty text."""
+    try:
+        cfg = run_config(folder)
+        if not isinstance(cfg, LeggedConfig):
+            command = command_on(read_record(folder), "play")
+            return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
+        torch.set_num_threads(1)
+        pictures = film(TrainedPolicy(cfg, find_checkpoint(folder, checkpoint)), SIDE)
+        if not exists(folder / CONFIG_FILE):
+            return "the run folder was removed"
+        write_film(pictures, folder / FILMS[0])
+    except (ConfigError, RunError) as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+@sub_command(
+    "legged runs compare anymal_c_flat/11-22_s1 anymal_c_flat/11-22_s2",
+    "legged runs compare anymal_c_flat go2_flat --out comparison",
+    arguments=(
+        *RUNS,
+        argument("--out", type=Path, default=LOGS, metavar="FOLDER", help=f"folder for the pages; {LOGS}/ by default"),
+    ),
+)
+def compare(args: argparse.Namespace) -> int:
+    """Show several runs side by side: `legged runs compare A B`.
+
+    comparison.html and .md show which settings differ, the learning curves over each other, and the evaluations with
+    confidence intervals. The first run is the reference.
+    """
+    if not 2 <= len(args.runs) <= MOST_COMPARED:
+        raise ConfigError(f"RUN: expected 2 to {MOST_COMPARED} runs, got {len(args.runs)}")
+    folders = _folders_of(args)
+    if len({run.resolve() for run in folders}) < len(folders):
+        raise ConfigError(f"RUN: a run comes twice: {', '.join(args.runs)}")
+    ready_to_write(args.out, 4.0)
+    records = [read_record(run) for run in folders]
+    make_folder(args.out)
+    page = write_pages(args.out / "comparison", "Comparison", comparison_parts(records))
+    print(f"written: {relative(page)}, {len(records)} runs")
+    return 0
+
+
+@sub_command(
+    "legged runs evaluations logs/anymal_c_flat/2026-11-22_05-38-19 logs/anymal_c_flat/2026-11-22_06-02-41",
+    "legged runs evaluations logs/anymal_c/*/evaluation_mujoco.json --types stairs_up,slope_up --out pictures",
+    arguments=(
+        argument(
+            "paths", nargs="+", type=Path, metavar="PATH", help="evaluation_<physics>.json files, or folders that hold them"
+        ),
+        argument("--types", help="terrain types to show, e.g. stairs_up,slope_up; all by default"),
+        argument("--out", type=Path, help="folder for success.png, a picture of success against difficulty"),
+    ),
+)
+def evaluations(args: argparse.Namespace) -> int:
+    """Show evaluation files side by side: `legged runs evaluations logs/anymal_c/RUN logs/anymal_c/RUN`.
+
+    Evaluations of one task in one engine count as its seeds: the tables give their mean and the largest deviation from it,
+    the picture their mean and range. Evaluations with other fields changed, or on another grid of commands, are kept apart.
+    """
+    if args.out:
+        ready_to_write(args.out)
+    results = read_results(args.paths)
+    if args.types:
+        keep_types(results, [name.strip() for name in args.types.split(",")])
+    episodes: Evaluations = {}
+    following: Evaluations = {}
+    for key, seeds in grouped(results).items():
+        of_episodes = {"episodes" in result for result in seeds}
+        if len(of_episodes) > 1:
+            told = "some evaluations are of commands, others of episodes; compare them apart"
+            raise ConfigError(f"{key[0]} in {key[1]}: {told}")
+        (episodes if of_episodes.pop() else following)[key] = seeds
+    tracked = {key: seeds for key, seeds in following.items() if any(map(has_tracking, seeds))}
+    with_success = {key: seeds for key, seeds in following.items() if any(map(types_in, seeds))}
+    console = Console(width=130)
+    for groups, table in ((tracked, tracking_table), (episodes, episodes_comparison), (with_success, success_table)):
+        if groups:
+            console.print(table(groups))
+    if args.out:
+        if not with_success:
+            raise ConfigError("--out: draws success against difficulty, and none of the evaluations holds that")
+        make_folder(args.out)
+        draw_comparison(with_success, args.out / "success.png")
+        print(f"written: {relative(args.out / 'success.png')}")
+    return 0
+
+
+@sub_command(
+    "legged runs curves anymal_c_flat/2026-11-22_05-38-19",
+    "legged runs curves logs/anymal_c/*_s1 logs/anymal_c/*_s2 --out pictures",
+    arguments=(
+        *RUNS,
+        argument("--out", type=Path, default=Path("."), help=f"folder for {PICTURE}; the working directory by default"),
+    ),
+)
+def curves(args: argparse.Namespace) -> int:
+    """Draw learning curves of runs as a picture: `legged runs curves anymal_c_flat`.
+
+    learning_curve.png shows returns, errors, falls and metrics over iterations, one line for each run, read from the
+    TensorBoard files. An axis on top shows the time, unless the runs differ by more than 5 % in the time of an iteration. For
+    runs on terrain the picture also shows the mean level of each type, and the shares of episodes after which robots moved up
+    and down.
+    """
+    folders = _folders_of(args)
+    ready_to_write(args.out)
+    logs = [Log(read_scalars(run), read_config(run)) for run in folders]
+    named = list(zip(labels(folders, [log.config for log in logs]), logs, strict=True))
+    charts = [*outcomes(named), *levels(logs)]
+    if not charts:
+        raise ConfigError(f"{relative(folders[0])}: its TensorBoard file holds no returns, errors or metrics")
+    make_folder(args.out)
+    draw_charts(charts, args.out / PICTURE, iteration_s=common_time([log.scalars for log in logs]))
+    print(f"written: {relative(args.out / PICTURE)}")
+    return 0
