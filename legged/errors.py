@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 
 LONGEST = 2000
-"""Largest length of an error's text, in characters. Longer texts, with long input of users, are shortened in the middle."""
+"""Largest length of an error's text, in characters. A longer text, such as one that quotes a long input, loses its middle."""
 
 
 def one_line(text: str) -> str:
@@ -36,12 +36,12 @@ class TermError(RuntimeError):
 
 
 class HostReadError(RuntimeError):
-    """Error for code of the step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
+    """Error for code in a step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
 
 
 def suggest(name: str, allowed: Iterable[str], what: str = "allowed") -> str:
-    """Return '; did you mean ...?' with the name in `allowed` that is nearest to `name`, if any, then all allowed names in
-    brackets after the word `what`.
+    """Return the end of an error message: '; did you mean ...?' with the name in `allowed` that is most like `name`, if any,
+    and all allowed names in brackets after the word `what`.
     """
     options = sorted(allowed)
     near = difflib.get_close_matches(name, options, n=1, cutoff=0.5)

@@ -9,14 +9,14 @@ from torch.nn.functional import mse_loss
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
-    """Return vectors (N, 3), given in the body frame of `quat` (N, 4), in the world frame."""
+    """Rotate vectors `vec` (N, 3) from the body frame of `quat` (N, 4) to the world frame."""
     w, xyz = quat[:, :1], quat[:, 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
-    """Return vectors (N, 3), given in the world frame, in the body frame of `quat` (N, 4)."""
+    """Rotate vectors `vec` (N, 3) from the world frame to the body frame of `quat` (N, 4)."""
     w, xyz = quat[:, :1], quat[:, 1:]
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
@@ -41,8 +41,8 @@ def yaw_of(quat: Tensor) -> Tensor:
 
 def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return roll, pitch and yaw [rad], (N,) each, of `quat` (N, 4), w first. The rotation consists of these turns about the
-    world's x, y and z axes, in this order. Each angle lies in [-pi, pi]. In Isaac Gym angles lie in [0, 2 pi), and
-    quaternions have w last.
+    world's x, y and z axes, in this order. Each angle lies in [-pi, pi]. Isaac Gym differs: its angles lie in [0, 2 pi), and
+    its quaternions have w last.
     """
     w, x, y, z = quat.unbind(dim=1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -73,13 +73,13 @@ def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
 
 
 def squared_difference(a: Tensor, b: Tensor) -> Tensor:
-    """Return (a - b)^2 of two tensors of the same shape, computed in one launch."""
+    """Return (a - b)^2 of two tensors of the same shape, computed in one kernel launch."""
     return mse_loss(a, b, reduction="none")
 
 
 def evenly_spaced(indices: Sequence[int]) -> slice | None:
-    """Return the slice that selects `indices` if they rise in equal steps, else None. A slice is a view and costs no
-    launch.
+    """Return the slice that selects `indices` if they rise in equal steps, else None. Indexing by a slice gives a view,
+    without a kernel launch.
     """
     steps = {after - before for before, after in pairwise(indices)} or {1}
     step = min(steps)

@@ -16,7 +16,7 @@ def state_of(owner: Any) -> dict[str, Tensor]:
 
 
 def load_state(owner: Any, state: Mapping[str, Any]) -> None:
-    """Copy the values saved by `state_of`, on any device, into the tensors of `owner.STATE`.
+    """Copy the values that `state_of` saved into the tensors of `owner.STATE`. The values may be on any device.
 
     Raises:
         StateError: a tensor is missing, or has another shape or type.
@@ -28,7 +28,7 @@ def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> No
     """Copy `saved` values into `tensors` of the same names. `of` is the owner's name, for errors.
 
     Raises:
-        StateError: a tensor is missing, or has another shape or type; nothing is copied then.
+        StateError: a tensor is missing, or has another shape or type. In this case no tensor is copied.
     """
     for name, tensor in tensors.items():
         value = saved.get(name) if isinstance(saved, Mapping) else None

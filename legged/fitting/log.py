@@ -13,12 +13,12 @@ from legged.robots.patterns import match_names
 MEASURED = ("target", "position", "velocity", "torque")
 DRIVE = ("stiffness", "damping", "torque_limit")
 NEEDED, OPTIONAL = ("joint_names", *MEASURED), ("dt", "time", "run", *DRIVE)
-"""Arrays of a file."""
+"""Required and optional arrays of a file."""
 BLOCKS = 10
-"""Blocks of time of a run; every `HELD_OUT`th block is held out."""
+"""Number of equal blocks of time in a run. Every `HELD_OUT`th block is held out."""
 HELD_OUT = 5
 FEWEST_HELD_OUT = 0.1
-"""Smallest share of the samples that whole runs must have to be held out."""
+"""Whole runs are held out only if they have at least this share of the samples."""
 UNEVEN = 0.01
 """Largest deviation of the time between samples, as a share of the mean time step."""
 SHORTEST = 200
@@ -42,7 +42,7 @@ class ActuatorLog:
     torque: np.ndarray
     """(T, D) measured torques [N m]."""
     stiffness: np.ndarray | None = None
-    """(D,) gains of the drives [N m/rad] and [N m s/rad], if known."""
+    """(D,) P gains of the drives [N m/rad], if known; `damping` are their D gains [N m s/rad]."""
     damping: np.ndarray | None = None
     torque_limit: np.ndarray | None = None
     """(D,) torque limits of the drives [N m], if known."""
@@ -85,14 +85,12 @@ class ActuatorLog:
         """Return the log at samples `dt` [s] apart: measurements are interpolated linearly, targets are the last ones sent.
 
         Raises:
-            ConfigError: the log's samples are further apart.
+            ConfigError: the log's samples are further apart than `dt`.
         """
         if np.isclose(dt, self.dt, rtol=UNEVEN):
             return replace(self, dt=dt)
         if dt < self.dt:
-            raise ConfigError(
-                f"--dt: the log was sampled every {self.dt:g} s; what happens within {dt:g} s can't be learned from it"
-            )
+            raise ConfigError(f"--dt: the log was sampled every {self.dt:g} s; must be at least that, got {dt:g}")
         parts: dict[str, list[np.ndarray]] = {name: [] for name in ("run", *MEASURED)}
         for number in np.unique(self.run):
             rows = np.flatnonzero(self.run == number)
@@ -109,7 +107,7 @@ class ActuatorLog:
 
 
 def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
-    """Return some runs, preferably every fifth, whose lengths add up to about a fifth, and their share of all samples."""
+    """Return runs, preferably every fifth, that together have about a fifth of all samples, and their exact share."""
     order = [i for first in reversed(range(HELD_OUT)) for i in range(first, len(lengths), HELD_OUT)]
     wanted, held, chosen = lengths.sum() / HELD_OUT, 0, []
     for i in order:
@@ -170,7 +168,7 @@ def read_log(path: Path) -> ActuatorLog:
     if "time" in arrays:
         steps.append(_even_step(numbers("time", f"{run.shape}", run.shape), run, path))
     if not steps:
-        raise ConfigError(f"{path}: 'dt' is missing: the time between two samples [s], or 'time' of each of them")
+        raise ConfigError(f"{path}: 'dt' is missing; add the time between two samples [s], or the 'time' of each sample [s]")
     if not steps[0] > 0.0:
         raise ConfigError(f"{path}: dt: must be above 0, got {steps[0]:g}")
     if not np.isclose(steps[-1], steps[0], rtol=UNEVEN):
@@ -179,22 +177,22 @@ def read_log(path: Path) -> ActuatorLog:
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
-    """Check that all joints of a log have the same gains and limits, since one drive is fitted to all, and that torques vary.
+    """Check that the torques of a log vary, and that its joints have the same gains and limits: one drive is fitted to all.
 
     Raises:
-        ConfigError: they do not.
+        ConfigError: the torques are constant, or the joints differ.
     """
     fitted_to = log.torque[~log.held_out]
     if fitted_to.min() == fitted_to.max():
         raise ConfigError(f"{path}: torque: is {fitted_to[0, 0]:g} N m throughout; nothing can be fitted to that")
-    for name in DRIVE if log.has_gains else DRIVE[2:]:  # a single gain is not used
+    for name in DRIVE if log.has_gains else DRIVE[2:]:  # the fit ignores one gain without the other
         values = getattr(log, name)
         if values is None or np.allclose(values, values[0], rtol=1e-4, atol=0.0):
             continue
         low, high = int(values.argmin()), int(values.argmax())
         raise ConfigError(
             f"{path}: {name}: {values[low]:.4g} at {log.joint_names[low]}, {values[high]:.4g} at {log.joint_names[high]}; one"
-            " drive is fitted to all joints, so choose some that are alike with --joints"
+            " drive is fitted to all joints, so choose joints with equal values with --joints"
         )
 
 
@@ -202,9 +200,7 @@ def _even_step(time: np.ndarray, run: np.ndarray, path: Path) -> float:
     """Return the time between two samples at the times `time` (T,) [s], which must not change within a run."""
     steps = np.diff(time)[np.diff(run) == 0]
     if not len(steps):
-        raise ConfigError(
-            f"{path}: run: no two samples in a row are of one run, so 'time' does not say how far apart they are"
-        )
+        raise ConfigError(f"{path}: run: no two consecutive samples have the same run, so 'time' does not give a time step")
     dt = float(np.median(steps))
     if dt <= 0.0 or np.abs(steps - dt).max() > max(UNEVEN * dt, 1e-9):
         worst = float(np.abs(steps - dt).max())

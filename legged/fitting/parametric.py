@@ -18,16 +18,16 @@ DAMPING, EASIER, HARDER = 1e-3, 0.3, 4.0
 FINEST = 1e-9
 """Relative improvement at which the search ends."""
 MOST_SAMPLES = 40_000
-"""Samples of the last searches, spread over the log."""
+"""Number of samples in each of the last searches, spread over the log."""
 ROUGHLY = 4_000
-"""Samples of the first search, over all delays."""
+"""Number of samples in the first search, which tries all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
 WORTH = 0.005
 """Share of the squared error that a friction peak at low speed must explain to be identified."""
 NARROWEST, WIDEST = 0.5 * SMOOTHING, 0.1
-"""Range of identifiable Stribeck velocities: at least NARROWEST [rad/s], below which friction fades, and at most the share
-WIDEST of the largest speed, above which a "peak" fits other effects of speed."""
+"""Range of identifiable Stribeck velocities. It begins at NARROWEST [rad/s], because friction fades below that speed. It ends
+at the share WIDEST of the largest speed, because a wider "peak" would fit other effects of speed."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ class Drive:
 
 
 def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
-    """Return the targets (T, D) of a log delayed by a number of samples, interpolated linearly; at the start of a run the
-    first target.
+    """Return the targets (T, D) of a log, delayed by a number of samples and interpolated linearly. Before the delay has
+    passed, a run has its first target.
     """
     first = np.maximum.accumulate(np.where(np.r_[True, np.diff(log.run) != 0], np.arange(len(log.run)), 0))
     whole = int(np.floor(samples))
@@ -92,7 +92,7 @@ def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
 
 def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     """Return the drive with the smallest error on a log's torques, without the held-out samples. Gains in the log are kept.
-    Without them the damping includes the viscous friction, which cannot be identified separately. Breakaway friction equals
+    Without gains, the damping includes the viscous friction, which cannot be identified separately. Breakaway friction equals
     Coulomb friction unless the log shows a peak at low speed.
     """
     every = np.flatnonzero(~log.held_out)
@@ -114,7 +114,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     tried = [search(float(k), of, of is limits, ROUGHLY) for k in delays for of in (start, limits)]
     best = min(tried, key=lambda one: one[0])[1]
     free = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
-    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # by the line, not by the effort limit
+    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # the line limits, not the effort
     limited = bool(np.isfinite(best.stall_torque)) and float(np.mean(reduced)) >= SEEN
     best = best if limited else free
     found = search(best.delay / log.dt, best, limited)

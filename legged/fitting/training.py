@@ -21,7 +21,7 @@ def train_network(
     log: ActuatorLog, kind: str, hidden: Sequence[int], samples: int, spacing: int, updates: int, seed: int
 ) -> NetworkWeights:
     """Return a network (`mlp` or `lstm`) with `hidden` units per layer, trained on the samples of a log that are not held
-    out. The inputs of an MLP are `samples` time steps, `spacing` samples apart.
+    out. An MLP reads the present sample and earlier ones, `samples` in all, `spacing` apart.
 
     Raises:
         ConfigError: the runs are too short.
@@ -45,7 +45,7 @@ def train_network(
 
 
 def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
-    """Return the torques (T, D) of a log by the network [N m], step by step as in a task, with a reset at each run."""
+    """Return the network's torques (T, D) for a log [N m], step by step as in a task, with a reset before each run."""
     joints = len(log.joint_names)
     network = ActuatorNetwork(weights, 1, joints, log.dt, torch.device("cpu"))
     error = torch.tensor(log.target - log.position, dtype=torch.float32)
@@ -61,13 +61,13 @@ def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
 
 
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the indices of training samples with at least `past` samples before them in the same run, none held out."""
+    """Return the indices of training samples that directly follow at least `past` other training samples of their run."""
     usable = ~log.held_out
     starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
     since = np.arange(len(usable)) - np.maximum.accumulate(np.where(starts, np.arange(len(usable)), 0))
     rows = np.flatnonzero(usable & (since >= past))
     if not len(rows):
-        raise ConfigError(f"log: no run has more than {past} samples in a row to learn from ({log.dt:g} s apart)")
+        raise ConfigError(f"log: no run has more than {past} consecutive training samples; record longer runs")
     return rows
 
 

@@ -12,17 +12,17 @@ from legged.errors import HostReadError
 
 
 class Constants:
-    """Cache of tensors made from the step's Python numbers. Each is made once on the device, because a graph can't copy from
-    the host.
+    """Cache of tensors made from the step's Python numbers. Each tensor is made once on the device, because a graph can't
+    copy from the host.
 
     Lists and numpy arrays in an index become tensors of positions. A list of bools becomes the positions of its True values,
-    whose number is known. Calls such as `torch.tensor` become copies of a cached constant.
+    so that the size of the result is known. Calls such as `torch.tensor` return copies of a cached constant.
     """
 
     def __init__(self) -> None:
         self._made: dict[Any, Tensor] = {}
         self.complete = False
-        """True once the step has run. A new constant then means that a number changes from step to step."""
+        """True once all constants exist. If the step then needs a new one, a number changes from step to step."""
         self.making = False
         """True while a constant is being made."""
 
@@ -30,17 +30,17 @@ class Constants:
         return len(self._made)
 
     def get(self, key: Any, make: Callable[[], Tensor]) -> Tensor:
-        """Return the constant of a key; make it if it is missing.
+        """Return the constant of a key, and make it first if it is missing.
 
         Raises:
-            HostReadError: the constant is missing, and the previous step did not need it.
+            HostReadError: the constant is missing, although all constants should exist (`complete`).
         """
         if key not in self._made:
             if self.complete:
                 raise HostReadError(
-                    "makes a tensor of other numbers than the step before; a CUDA graph repeats the first ones"
+                    "makes a tensor from numbers that differ from the previous step's; a CUDA graph would repeat the old ones"
                 )
-            with self._free(), torch.inference_mode(False):  # an ordinary tensor, which autograd may keep
+            with self._free(), torch.inference_mode(False):  # autograd can't keep tensors made in inference mode
                 self._made[key] = make()
         return self._made[key]
 
@@ -54,8 +54,8 @@ class Constants:
             self.making = False
 
     def pick(self, tensor: Tensor, index: Any) -> tuple[Tensor, Any]:
-        """Return a tensor and an index that select the same as `tensor[index]`, where `index` holds scalar tensors on the
-        device, as in `forces[:, feet[0]]`. torch would read each of these on the host.
+        """Return a tensor and an index that select the same values as `tensor[index]`, but without scalar tensors in the
+        index. torch would read a scalar tensor, as in `forces[:, feet[0]]`, on the host.
         """
         parts = index if isinstance(index, tuple) else (index,)
         for place, part in enumerate(parts):
@@ -71,7 +71,7 @@ class Constants:
         """Return an equivalent index of `tensor` without lists, arrays, or tensors of another device."""
         parts = index if isinstance(index, tuple) else (index,)
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
-            raise HostReadError("indexes by a list of tensors, whose values a CUDA graph cannot hold; torch.stack them")
+            raise HostReadError("indexes by a list of tensors: a CUDA graph cannot hold their values; use torch.stack")
         if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
             return index  # torch interprets most sequences as tuples and warns
         pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
@@ -85,7 +85,7 @@ class Constants:
         with self._free():
             array = np.asarray(part)
         if array.dtype == bool:
-            if not self.complete:  # raises torch's own error for a mask of the wrong shape
+            if not self.complete:  # let torch raise its own error for a mask of the wrong shape
                 with self._free():
                     torch.empty(1, device="cpu").expand(tensor.shape).__getitem__(index)
             return tuple(self._constant(rows, tensor.device) for rows in np.nonzero(array))
@@ -100,13 +100,13 @@ class Constants:
 
 
 def _is_number(part: Any) -> bool:
-    """Return True if a part of an index is a scalar tensor of an integer."""
+    """Return True if a part of an index is a scalar integer tensor."""
     kinds = (torch.int64, torch.int32, torch.int16, torch.int8)
     return isinstance(part, Tensor) and part.dim() == 0 and part.dtype in kinds
 
 
 def _dimensions(part: Any) -> int:
-    """Return the number of a tensor's dimensions that a part of an index uses up."""
+    """Return how many dimensions of a tensor a part of an index consumes."""
     if part is None or part is Ellipsis or isinstance(part, bool):
         return 0
     is_mask = isinstance(part, Tensor | np.ndarray) and part.dtype in (torch.bool, torch.uint8, np.bool_)

@@ -52,19 +52,20 @@ class ForbidHostReads:
     `if tensor`, `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, random numbers of
     the host.
 
-    If the same step runs several times, the guard also compares the runs, from the third on. The attributes of `owner` other
-    than tensors must not change. The numbers passed to torch must be the same. The step must not read a tensor that the
-    previous step allocated, because a graph goes on reading the memory of its capture. A tensor may be allocated, kept as an
-    attribute, and read outside the step or later in the same step. The first runs may set up anything that they keep.
+    If the same step runs several times, the guard also compares each run from the third on with the run before it. The
+    attributes of `owner` other than tensors must not change. The numbers passed to torch must be the same. The step must not
+    read a tensor that the previous step allocated, because a graph goes on reading the memory of its capture. A tensor may be
+    allocated, kept as an attribute, and read outside the step or later in the same step. The first two runs may set up
+    attributes.
 
-    This package's own physics engines are exempt. Those on the host work on numpy arrays and are never captured.
+    The physics engines of this package are exempt. Engines on the host work on numpy arrays and are never captured.
     """
 
     STEPS = 3
     """Number of runs that complete all checks."""
 
     def __init__(self, device: torch.device | None = None, owner: Any = None) -> None:
-        """Guard a step on `device`, the CPU by default, of the task `owner`."""
+        """Guard a step of the task `owner` on `device`, by default the CPU."""
         self.device = device or torch.device("cpu")
         self.owner = owner
         self.constants = Constants()
@@ -101,11 +102,11 @@ class ForbidHostReads:
         if kind is None:
             self._judge_state(self._state)
             if self.compares and len(self._record) != len(self._record_before):
-                raise HostReadError("the step makes fewer calls than the previous one; a CUDA graph repeats the same ones")
+                raise HostReadError("the step makes fewer calls than the previous step; a CUDA graph would repeat them all")
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Refuse new constants in the block, in which a graph is captured. All constants that it needs exist already."""
+        """Refuse new constants in the block, which captures a graph, because all constants of the step exist already."""
         self.constants.complete = True
         with self._calls:
             yield
@@ -144,14 +145,14 @@ class ForbidHostReads:
             found = now["attributes"].get(name)
             if found != state:
                 raise HostReadError(
-                    f"self.{name} changed from {shown(state)} to {shown(found)}: a CUDA graph repeats what was recorded;"
-                    " keep it in a tensor and write that in place"
+                    f"self.{name} changed from {shown(state)} to {shown(found)}: a CUDA graph repeats the recorded value;"
+                    " keep it in a tensor, and write the tensor in place"
                 )
 
     # ---- what the modes see ----------------------------------------------------------------------------------------------
 
     def run(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Run one operator and compare it with that of the previous step."""
+        """Run one operator, and compare it with the operator in the same place of the previous step."""
         inputs = [value for value in tree_leaves((args, kwargs)) if value is not None]
         over = overwritten(func, args, kwargs)
         read = [value for value in inputs if all(value is not other for other in over)]
@@ -178,14 +179,14 @@ class ForbidHostReads:
         before = self._record_before[place] if place < len(self._record_before) else Seen("nothing", {})
         if seen.call != before.call:
             raise HostReadError(
-                f"calls {shown(seen.call)} where the step before called {shown(before.call)}: a CUDA graph repeats what was"
-                " recorded; keep what changes in a tensor"
+                f"calls {shown(seen.call)} where the previous step called {shown(before.call)}: a CUDA graph repeats the"
+                " recorded call; keep numbers that change in a tensor"
             )
         for memory in seen.memory.keys() - before.memory.keys():
             name = next((f"self.{name}" for name, own in self._tensors() if memory_of(own) == memory), "")
             raise HostReadError(
-                f"reads {name or 'a tensor'}, which was another tensor in the step before: a CUDA graph goes on reading the"
-                f" one of its recording; allocate it once and write in place, {name or 'tensor'}.copy_(...)"
+                f"reads {name or 'a tensor'}, but the previous step read another tensor there: a CUDA graph goes on reading"
+                f" the recorded one; allocate the tensor once and write in place, {name or 'tensor'}.copy_(...)"
             )
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
@@ -201,7 +202,7 @@ class ForbidReads(TorchDispatchMode):
     """Dispatch mode that refuses, in its block, operators that read certain tensors or parts of them."""
 
     def __init__(self, tensors: Mapping[str, Tensor], reason: str) -> None:
-        """Refuse reads of `tensors`, a map from their names in errors. An error gives the `reason` after the name."""
+        """Refuse reads of `tensors`, a map from the name that an error gives. The `reason` follows the name."""
         super().__init__()
         self._names = {memory_of(tensor): name for name, tensor in tensors.items()}
         self._reason = reason
@@ -229,8 +230,8 @@ class Seen:
     call: str
     """Name of the operator and its arguments other than tensors."""
     memory: dict[int, StorageWeakRef]
-    """Memory of the argument tensors that the step itself did not make. The references prevent confusion with later tensors
-    in the same place."""
+    """Memory of the argument tensors that the step itself did not make. While such a reference exists, no later tensor gets
+    the same identifier."""
 
 
 def memory_of(value: Any) -> int | None:
@@ -270,9 +271,9 @@ def default_device() -> torch.device | None:
     return asked[-1] if asked else None
 
 
-UNCHECKED = "looks on the host whether it succeeded (inv, solve); torch.linalg.inv_ex and the like do not"
+UNCHECKED = "checks on the host whether it succeeded (inv, solve); torch.linalg.inv_ex and solve_ex do not"
 
-DECOMPOSED = "looks on the host whether it converged (svd, eigh, eig, and pinv, cond and matrix_rank, which use them)"
+DECOMPOSED = "checks on the host whether it converged (svd, eigh and eig; pinv, cond and matrix_rank use them)"
 
 
 class _Operators(TorchDispatchMode):
@@ -288,11 +289,11 @@ class _Operators(TorchDispatchMode):
         aten._linalg_eigh.default: DECOMPOSED,
         aten.linalg_eig.default: DECOMPOSED,
         aten.linalg_pinv.atol_rtol_tensor: DECOMPOSED,
-        aten.linalg_matrix_exp.default: "looks at the size of its matrices on the host (matrix_exp)",
+        aten.linalg_matrix_exp.default: "reads the norm of its matrices on the host (matrix_exp)",
         aten._to_sparse.default: "has a result of unknown size (to_sparse)",
-        aten.normal.Tensor_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(mean) does not",
-        aten.normal.float_Tensor: "looks at its deviations on the host; mean + std * torch.randn_like(std) does not",
-        aten.multinomial.default: "looks at its weights on the host (multinomial)",
+        aten.normal.Tensor_Tensor: "reads its standard deviations on the host; mean + std * torch.randn_like(mean) does not",
+        aten.normal.float_Tensor: "reads its standard deviations on the host; mean + std * torch.randn_like(std) does not",
+        aten.multinomial.default: "reads its weights on the host (multinomial)",
         aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
     }
 
@@ -302,7 +303,7 @@ class _Operators(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        with self:  # in inference mode, composite operators (item, one-argument where) arrive whole: take them apart
+        with self:  # decompose: in inference mode, composite operators (item, one-argument where) arrive whole
             result = func.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
@@ -357,12 +358,12 @@ class _Calls(TorchFunctionMode):
         elif func is Tensor.to and self._is_host(*args[1:], *kwargs.values()):
             guard.refuse('copies to the host (.to("cpu"))')
         elif func is Tensor.type and args[1:] and not isinstance(args[1], torch.dtype):
-            guard.refuse("copies to the host (.type of a CPU tensor's type); .to(torch.int64) and the like do not")
+            guard.refuse("copies to the host (.type with a CPU type); .to(torch.int64) does not, nor .to with another dtype")
         elif func is Tensor.new_tensor:
             return self._constant(func, args[1], args, kwargs, (args[0].dtype, args[0].device))
         elif func in _device_constructors() or func is torch.normal:
             return self._factory(func, args, kwargs)
-        elif func is torch.nn.functional.one_hot and len(args) > 1 and args[1] > 0:  # the CPU version reads the values
+        elif func is torch.nn.functional.one_hot and len(args) > 1 and args[1] > 0:  # one_hot on a CPU reads the values
             return (args[0].unsqueeze(-1) == torch.arange(args[1], device=args[0].device)).long()
         return func(*args, **kwargs)
 
@@ -382,7 +383,7 @@ class _Calls(TorchFunctionMode):
             return func(*args, **kwargs)
         if device is None:
             self._guard.refuse(f"torch.{func.__name__} without a device makes a tensor on the CPU: {ON_THE_DEVICE}")
-        elif self._is_host(device) and not caller().startswith("legged."):  # the learner's device is a text
+        elif self._is_host(device) and not caller().startswith("legged."):  # the learner passes its device as a text
             self._guard.refuse(f"torch.{func.__name__} makes a tensor on the CPU: {ON_THE_DEVICE}")
         elif func in self.OF_DATA:
             return self._constant(func, given[0], args, kwargs, (device,))
@@ -391,7 +392,7 @@ class _Calls(TorchFunctionMode):
     def _constant(self, func: Any, data: Any, args: Any, kwargs: Any, kind: Any) -> Any:
         """Return a copy of the constant that the call would make."""
         if holds_tensors(data) and not isinstance(data, Tensor):
-            self._guard.refuse(f"{func.__name__} of a list of tensors reads their values on the host; torch.stack them")
+            self._guard.refuse(f"{func.__name__} of a list of tensors reads their values on the host; use torch.stack")
         key = key_of(data)
         if key is None:
             return func(*args, **kwargs)

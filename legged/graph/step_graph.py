@@ -14,9 +14,9 @@ __all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGra
 class Branch:
     """Work in parallel to the rest of the step: a second stream on a GPU, and a parallel branch of the captured graph.
 
-    The step's small launches are bound by latency, so parallel ones cost nothing. Tensors that both streams use must be
-    allocated before `fork`, because a stream may reuse memory that another still reads. Call `join` before the next physics
-    step, because the solver's conditional node cannot be captured while a branch is open.
+    The step's small kernels are bound by latency, so kernels in a parallel branch cost nothing. Tensors that both streams use
+    must be allocated before `fork`, because one stream may reuse memory that the other still reads. Call `join` before the
+    next physics step, because the solver's conditional node cannot be captured while a branch is open.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -34,7 +34,7 @@ class Branch:
             yield
 
     def join(self) -> None:
-        """Make the code after this call wait for the block."""
+        """Make the code after this call wait for the block of `fork`."""
         if self._stream is not None:
             torch.cuda.current_stream(self._stream.device).wait_stream(self._stream)
 
@@ -59,7 +59,7 @@ class StepGraph:
     """Runner of a step function: eagerly on the CPU, by replays of a captured CUDA graph on a GPU.
 
     The function may only use tensors with fixed addresses. The constructor calls it a few times, to compile kernels and to
-    check that it can be captured. The caller resets its state afterwards.
+    check that it can be captured. The caller resets the task's state afterwards.
     """
 
     WARM_UP_STEPS = 3
@@ -73,7 +73,7 @@ class StepGraph:
         rehearse: Callable[[], None] | None = None,
     ) -> None:
         """Check or capture `function`. With `enabled` false it runs eagerly and unchecked. If `function` repeats the same
-        work many times, `rehearse` does that work once, which is enough for warm-up and check.
+        work many times, `rehearse` does that work once; warm-up and check call `rehearse` instead.
 
         Raises:
             TermError: a term of the task can't be captured.
@@ -96,7 +96,7 @@ class StepGraph:
             raise
 
     def _check(self) -> None:
-        """Run the step under the guard, which names the cause of an error. A failed capture would not."""
+        """Run the step under the guard. Its errors name their cause, unlike the error of a failed capture."""
         for step in range(self._checks):
             # The first step uses up random numbers, as any rehearsal does. The steps compared with it leave the host's
             # generator unchanged.
@@ -109,8 +109,7 @@ class StepGraph:
         wp.init()  # a step without Warp kernels has not initialised Warp yet
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
-        # Warp looks up a device at its first use, and a stream when it first sees it. During a capture these calls would
-        # fail.
+        # Warp looks up a device and a stream when they are first used. During a capture these calls would fail.
         with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
             wp.zeros(1, dtype=float, device=wp.device_from_torch(device))
         with torch.cuda.stream(stream):
@@ -120,11 +119,11 @@ class StepGraph:
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
-        # Each of several processes has a thread for collective operations, which may call CUDA during the capture.
+        # With several processes, each has a thread for collective operations that may call CUDA during the capture.
         error_mode = "thread_local" if torch.distributed.is_initialized() else "global"
         failure: Exception | None = None
         try:
-            # Torch owns the capture. Warp is told of it, so that the solver's loop becomes a conditional node.
+            # Torch makes the capture. Warp has to know of it, so that the solver's loop becomes a conditional node.
             with garbage_kept(), torch.cuda.graph(graph, stream=stream, capture_error_mode=error_mode):
                 warp_stream = wp.stream_from_torch(torch.cuda.current_stream(device))
                 with wp.ScopedStream(warp_stream, sync_enter=False), wp.ScopedCapture(stream=warp_stream, external=True):
@@ -135,7 +134,7 @@ class StepGraph:
                         failure = error
                         raise
         except Exception as error:
-            failure = failure or error  # ending a broken capture fails too, and its error hides the cause
+            failure = failure or error  # the end of a broken capture fails too; that error would hide the cause
         if failure is not None:
             raise failure
         return graph

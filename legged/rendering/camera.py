@@ -31,8 +31,8 @@ INK = (40, 40, 40)
 ON_A_PLANE = 130.0, -18.0
 """Azimuth and elevation of the camera on a plane [degrees]."""
 GLIDE, SMOOTH = 0.1, np.array([0.12, 0.12, 0.05])
-"""Share of the distance to the robot that the camera covers per picture, on a plane and, along x, y, z, over terrain. It is
-small so that steps do not shake the camera.
+"""Share of the distance to the robot that the camera covers per picture: GLIDE on a plane, SMOOTH along x, y and z over
+terrain. Small shares keep steps from shaking the camera.
 """
 CUT = 1.5
 """Distance above which the camera over terrain jumps to the robot at once, because the robot was put elsewhere [m]."""
@@ -43,7 +43,7 @@ BEHIND, FRONT = 62.0, 118.0
 AHEAD, DROP = 3.0, 0.1
 """A robot walks down if the ground at the distance AHEAD is lower by DROP [m]."""
 CLEAR = 0.35
-"""Clearance of the line of sight above the ground, beyond the robot's surroundings [m]."""
+"""Smallest height of the line of sight above the ground, except near the robot [m]."""
 COMMANDED = (0.10, 0.75, 0.25, 1.0)
 ACTUAL = (0.15, 0.45, 0.95, 1.0)
 SHADE = (0.05, 0.05, 0.05, 0.4)
@@ -52,7 +52,7 @@ SPACING = 1.82
 FOLLOWED_FROM = 3.45
 """Distance of the camera from the robot that it follows over terrain, in lengths of a robot: 3.6 m for ANYmal C."""
 NEAR, FARTHER = 1.92, 1.05
-"""Distance of the camera on a plane is NEAR + FARTHER * sqrt(number of robots), in lengths of a robot."""
+"""The camera's distance on a plane is NEAR + FARTHER * sqrt(number of robots), in lengths of a robot."""
 ABOVE, APART = 0.335, 0.086
 """Height of the lower arrow above the base, and of the upper arrow above the lower one, in lengths of a robot."""
 ARROW, SLOWEST_SHOWN = 0.6, 0.03
@@ -60,7 +60,7 @@ ARROW, SLOWEST_SHOWN = 0.6, 0.03
 SPOT, LIFTED = 0.086, 0.38
 """Radius of the spot below a foot on the ground, and foot height at which the spot is smallest, in lengths of a robot."""
 ROOT, AWAY = 1, 2.4
-"""Body that a ModelCamera follows, the first one after the world, and its distance in lengths of the model."""
+"""A ModelCamera follows the body ROOT, the first one after the world, at a distance of AWAY lengths of the model."""
 DRAWN = 1000.0
 """Half the side of a drawn ground plane [m]."""
 AZIMUTH, ELEVATION = 90.0, -12.0
@@ -84,7 +84,7 @@ class Camera:
         self.view = mujoco.MjvCamera()
 
     def update(self) -> None:
-        """Read `data` and `view`; removes the shapes that `add_shape` has added."""
+        """Read `data` and `view`, and remove the shapes that `add_shape` has added."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
@@ -126,8 +126,8 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
         raise RunError(f"cannot render here: {headless.NO_PICTURES}")
     library = off_screen_library()
     if sys.platform == "linux" and "MUJOCO_GL" not in os.environ and library is not None and not window_opens():
-        # MuJoCo's default, GLFW, cannot open a window. MuJoCo aborts when a renderer is created after a failure, so another
-        # library is chosen before the first one.
+        # MuJoCo's default, GLFW, cannot open a window here. If a renderer fails, MuJoCo aborts at the creation of the next
+        # one. So another library is chosen before the first renderer is created.
         os.environ["MUJOCO_GL"] = library
         gl_context.GLContext = import_module(f"mujoco.{library}").GLContext
     try:
@@ -135,7 +135,7 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
             warnings.simplefilter("ignore")  # glfw warns before it fails
             return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
     except Exception as error:  # each GL library has its own exceptions
-        needed = "without a display MUJOCO_GL=egl or MUJOCO_GL=osmesa and their libraries are needed"
+        needed = "on a machine without a display, install EGL or OSMesa and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
         raise RunError(f"cannot render here ({error}); {needed}") from error
 
 
@@ -201,15 +201,15 @@ def frame(
     """Return the nearest viewpoint from which all `points` (N, 3), world frame [m], are seen: the point (3,) in the middle of
     the picture, the camera's distance from it [m], and the extent (2,) of the points across and up in the picture.
 
-    `reach` are the tangents of the angles from the middle of the picture to the right and to the upper end of the area to
-    fill; the returned extent has the same unit.
+    `reach` holds two tangents: those of the angles from the middle of the picture to the right end and to the upper end of
+    the area that the points fill. The returned extent has the same unit.
     """
     forward = direction(azimuth, elevation)
     right = np.array([np.sin(np.radians(azimuth)), -np.cos(np.radians(azimuth)), 0.0])
     axes = np.stack([right, np.cross(right, forward)])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     depth, aside = (points - middle) @ forward, (points - middle) @ axes.T
-    # A point at `aside` is on the picture if |aside - shift| <= reach * (distance + depth), on either side of either axis.
+    # A point at `aside` is in the picture if |aside - shift| <= reach * (distance + depth) along both axes.
     high, low = ((sign * aside / reach - depth[:, None]).max(axis=0) for sign in (1.0, -1.0))
     distance = float(0.5 * (high + low).max())
     shift = 0.5 * np.asarray(reach) * (high - low)
@@ -219,12 +219,12 @@ def frame(
 
 class Follower:
     """The viewpoint of a camera at the side of a robot. Over terrain the camera is behind robots that walk up and in front of
-    robots that walk down, so that the faces of steps are visible. It looks down steeply enough to see over the rim of a pit.
+    robots that walk down, so that the faces of steps are visible. The camera looks down steeply enough to see into a pit.
     Robots are assumed to walk along x.
     """
 
     def __init__(self, view: mujoco.MjvCamera, distance: float, ground: HeightMap | None) -> None:
-        """Set the viewpoint `view` from now on, `distance` [m] away; without `ground` robots stand on a plane."""
+        """Control the viewpoint `view` at `distance` [m] from the robot. Without `ground`, robots stand on a plane."""
         self.view, self.ground = view, ground
         self.glide: np.ndarray | float = GLIDE if ground is None else SMOOTH
         self.begun = False
@@ -261,7 +261,7 @@ class Follower:
 
 class RobotsCamera(Camera):
     """A camera for `count` robots of a task, the first ones unless `turn_to` selects others. On a plane the robots stand side
-    by side and the camera follows their middle; on terrain it follows the robot number `followed` of them. Arrows show
+    by side, and the camera follows their middle. On terrain the camera follows one of them, number `followed`. Arrows show
     the commanded and the actual velocity.
     """
 
@@ -280,7 +280,7 @@ class RobotsCamera(Camera):
         self.centre = np.array([0.0, 0.0, 0.5 * self.sides[2]])
         """(3,) point in the middle of a picture on a plane, relative to the ground below the middle of the robots [m]."""
         self.arrows = True
-        """Draw the velocities."""
+        """True if velocities are drawn."""
         self.ground = None if task.terrain is None else task.terrain.height_map
         if self.ground is None:
             self.offsets = SPACING * length * side_by_side(count, int(np.ceil(count**0.5)))
@@ -348,7 +348,7 @@ class RobotsCamera(Camera):
 
 
 class ModelCamera(Camera):
-    """A camera for one environment of a task, which follows the centre of mass of its root body's subtree."""
+    """A camera for one environment of a task. It follows the centre of mass of the root body's subtree."""
 
     def __init__(self, task: BaseTask, width: int = 960, height: int = 540) -> None:
         """Build the scene and its renderer.
@@ -375,9 +375,9 @@ def drawn_model(task: BaseTask, width: int, height: int) -> mujoco.MjModel:
     """Return a copy of a task's model for pictures of that size [pixels], with few effects and wide ground planes."""
     model = copy.deepcopy(task.physics.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # ten times faster without a GPU
-    # A plane, which is infinite in the simulation, is drawn large enough; its texture keeps its scale. MuJoCo would also draw
-    # it infinite, but shift it with the camera, so that two pictures of one state differ.
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # speeds rendering without a GPU up tenfold
+    # Planes are infinite in the simulation. They are drawn as large finite ones, with textures of the same scale, because
+    # MuJoCo shifts an infinite plane with the camera: two pictures of the same state would differ.
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
         half, material = model.geom_size[plane, :2], int(model.geom_matid[plane])
         if material >= 0 and (half > 0.0).all() and not model.mat_texuniform[material]:
@@ -395,7 +395,7 @@ def follow_root(view: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
 
 
 def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 540) -> ModelCamera | RobotsCamera:
-    """Return a camera for a task, with pictures of that size [pixels]; of legged robots it draws the first `count`.
+    """Return a camera for a task, with pictures of that size [pixels]. In a task of legged robots it draws the first `count`.
 
     Raises:
         RunError: this machine cannot render.
@@ -409,8 +409,8 @@ def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 54
 
 
 def caption(picture: np.ndarray, lines: Sequence[str], colors: Sequence[Sequence[float]] = ()) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner; the first lines have slightly
-    darker versions of `colors` (red, green, blue, 0 to 1).
+    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner. The first lines are written
+    in slightly darker versions of `colors` (red, green, blue, 0 to 1).
     """
     if not lines:
         return picture

@@ -17,14 +17,14 @@ SHOWN_DEPTH = 0.6
 LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
 """Colours of the deepest, the level and the highest ground."""
 FAR = 100.0
-"""Extent of the level ground from the middle of a terrain; at least 1.2 times half the terrain's side [m]."""
+"""Smallest extent of the level ground from the middle of a terrain [m]; for large terrain, 1.2 times half its side."""
 CHECKER = 0.94, 1.0
 """Brightness of dark and of light squares."""
 SQUARE = 0.5
 """Side of a square [m]."""
 GROUND = "terrain_checker"
 LEVEL_RANGE = 0.9
-"""Height above and below 0 up to which colours change, or more for higher ground [m]."""
+"""Colours change between this height below and above 0. Checkered terrain extends this range to its largest height [m]."""
 
 
 def add_sky(scene: mujoco.MjSpec) -> None:
@@ -45,7 +45,7 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
     scene = mujoco.MjSpec()
     look = scene.visual
     look.global_.offwidth, look.global_.offheight = width, height
-    look.quality.shadowsize = look.quality.offsamples = 0  # ten times faster without a GPU
+    look.quality.shadowsize = look.quality.offsamples = 0  # speeds rendering without a GPU up tenfold
     look.map.zfar = 60
     scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
     add_sky(scene)
@@ -56,7 +56,7 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
     else:
         add_painted_terrain(scene, terrain, checkered=True)
         add_horizon(scene, terrain)
-        # Most light comes from the left behind the camera, so that treads, risers and flanks differ in brightness.
+        # Most light comes from behind the camera, on the left, so that treads, risers and flanks differ in brightness.
         sunlight, ambient, headlight, sun = [0.3, -0.35, -0.9], 0.42, 0.12, 0.62
     look.headlight.ambient, look.headlight.diffuse = [ambient] * 3, [headlight] * 3
     kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
@@ -73,7 +73,7 @@ def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
 
 
 def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[float], side: int) -> mujoco.MjsMaterial:
-    """Return a new material of squares of two colours, whose texture is `side` pixels wide."""
+    """Return a new material of squares of two colours. Its texture is `side` pixels wide."""
     kind, builtin = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     scene.add_texture(name=name, type=kind, builtin=builtin, rgb1=one, rgb2=other, width=side, height=side)
     material = scene.add_material(name=name, texuniform=True)
@@ -82,8 +82,8 @@ def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[f
 
 
 def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool = False) -> None:
-    """Add a terrain without collisions, coloured by height. With `checkered` level ground and slopes have squares, which show
-    the motion of a camera; steps have none, because their squares would make a picture a third slower.
+    """Add a terrain without collisions, coloured by height. With `checkered`, level ground and slopes have squares that show
+    the motion of a camera. Steps have none, because their squares would make rendering a third slower.
     """
     span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
     if checkered:
@@ -110,8 +110,8 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
 
 
 def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
-    """Colour a geom by height, up and down to `span` [m]: one colour for a box, a texture for a height field, whose points
-    below the `lowest` ground are hidden. With the distance `cell` between the points of height fields [m], draw squares.
+    """Colour a geom by its heights between -`span` and `span` [m]: a box by one colour, a height field by a texture. Points
+    of a height field below the `lowest` ground [m] are hidden. With the edge `cell` of the terrain's cells [m], draw squares.
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]
@@ -133,8 +133,9 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: floa
 
 
 def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
-    """Return heights (X, Y) in which each `sunk` point has the mean height of its neighbours that are not sunk, or of all
-    such points. Textures are blurred, so the colour of hidden points would otherwise show at the edge of visible ones.
+    """Return heights (X, Y) in which each `sunk` point has the mean height of its neighbours that are not sunk. If all
+    neighbours are sunk, it has the mean of all points that are not. Otherwise the colours of hidden points would show at the
+    edge of visible ones, because textures are blurred.
     """
     if not sunk.any():
         return heights
@@ -146,6 +147,6 @@ def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
 
 
 def color(heights: np.ndarray, span: float = LEVEL_RANGE) -> np.ndarray:
-    """Return colours (..., 3), 0 to 1, of heights (...) [m]; they change between -`span` and `span` [m]."""
+    """Return colours (..., 3), 0 to 1, of heights (...) [m]. Colours change between heights of -`span` and `span` [m]."""
     t = np.clip(heights / span, -1.0, 1.0)
     return np.stack([np.interp(t, (-1.0, 0.0, 1.0), stops) for stops in np.array([LOW, MIDDLE, HIGH]).T], axis=-1)

@@ -20,7 +20,7 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, tile_size
 MARGIN = 2.0
 """Width of the visible border around the tiles [m]."""
 WIDTH = 1600
-"""Width of a picture; its height is that of the terrain in it [pixels]."""
+"""Width of a picture [pixels]. The height follows from the terrain's proportions."""
 AZIMUTH, ELEVATION = 14.0, -35.0
 """The camera looks along x and down, a little from the side [degrees]."""
 FILLED = 0.96
@@ -47,7 +47,7 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
     count = len(types)
     columns = count if count <= 3 else -(-count // 2) if count <= 8 else 4
     rows = -(-count // columns)
-    # The camera looks along x: the first row is the farthest, the first column the leftmost.
+    # The camera looks along x. So the first types, in the upper left corner, have the largest row and column.
     places = {(rows - 1 - i // columns, columns - 1 - i % columns): name for i, name in enumerate(types)}
     names = [[places.get((r, c), "flat") for c in range(columns)] for r in range(rows)]
     terrain, robot = tiles(cfg.terrain, names, difficulty, cfg.env.seed), load_robot(cfg.robot)
@@ -98,7 +98,7 @@ def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.Mj
 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, robot: Robot) -> None:
-    """Put each robot on the middle of its tile (N, 3), its lowest foot on the ground, facing the camera."""
+    """Put each robot at its tile's origin (N, 3) [m], facing the camera, with the lowest foot on the ground."""
     states = data.qpos.reshape(len(origins), len(robot.default_qpos))
     states[:] = robot.default_qpos
     states[:, :3] = origins
@@ -119,7 +119,7 @@ def _label_at(terrain: Terrain, row: int, col: int) -> np.ndarray:
 
 
 def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
-    """Write a map of the heights, x upward and y to the left, with the tiles, their types and `levels` (R,), and origins."""
+    """Write a map of the heights to `path`, with the edges, types, `levels` (R,) and origins of the tiles."""
     import_matplotlib()
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -130,7 +130,7 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     length, width = terrain.tile_size
     hidden = round(max(0.0, terrain.border - MARGIN) / ground.cell)
     shown = slice(hidden, ground.heights.shape[0] - hidden), slice(hidden, ground.heights.shape[1] - hidden)
-    # Seen with x upward and y to the left; the light comes from the upper left.
+    # On the map, x points upward and y to the left. The light comes from the upper left.
     heights = ground.heights[shown][::-1, ::-1]
     largest = max(float(np.abs(heights).max()), 0.05)
     # The scale is about linear up to 0.25 m and logarithmic above, so that low steps show next to high ones.
@@ -155,7 +155,7 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
         top.set_xticks(middles, [terrain.types[group[0]] for group in groups])
         top.tick_params(length=0)
         for label, group in zip(top.get_xticklabels(), groups, strict=True):
-            if 0.75 * across * len(group) / columns < 0.09 * len(label.get_text()):  # wider than its columns
+            if 0.75 * across * len(group) / columns < 0.09 * len(label.get_text()):  # the label is wider than its columns
                 label.set(rotation=30, ha="left")
         right = axis.secondary_yaxis("right")
         right.set_yticks(0.5 * (ends_x[1:] + ends_x[:-1]), levels)

@@ -1,7 +1,7 @@
-"""One robot in C MuJoCo, with sensors, and with the motors of training, whose commands arrive at any time.
+"""One robot in C MuJoCo, with sensors and with the motors of training. Commands may arrive at any time.
 
-`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot the
-operations of a physics step take 0.1 ms in torch and 0.02 ms in numpy, about as long as MuJoCo's own step.
+`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot, they
+take 0.1 ms per physics step in torch, but 0.02 ms in numpy, which is about as long as MuJoCo's own step.
 """
 
 from collections import deque
@@ -25,7 +25,7 @@ from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
-"""Additional sources, known to a simulator, which a robot would have to estimate."""
+"""Additional sources. A simulator knows them; a real robot would have to estimate them."""
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 """Warnings of MuJoCo that accompany a reset of the state."""
 FALLEN = 1.2
@@ -37,9 +37,9 @@ OURS = "control.actuator"
 def motors_config(
     robot: Robot, contract: Contract | None, ideal: bool, changes: Iterable[tuple[str, Any]], dt: float
 ) -> tuple[ActuatorConfig, float]:
-    """Return the configuration of the motors and the time unit of their delay [s]. The motors are those of the training of
-    `contract`'s policy, or ideal ones, with `changes` of control.actuator. Without a contract the unit is the motors' step
-    `dt`.
+    """Return the configuration of the motors and the time unit of their delay [s]. The motors are ideal, or those with
+    which the policy of `contract` was trained. `changes` of control.actuator apply to either. Without a contract, the time
+    unit is the motors' step `dt`.
 
     Raises:
         ConfigError: a change concerns another section, or the motors do not fit the robot or the step.
@@ -48,7 +48,7 @@ def motors_config(
     for key, _ in changes:
         if key != OURS and not key.startswith(f"{OURS}."):
             raise ConfigError(
-                f"command line: {key}: only {OURS} can be changed of a simulated robot, e.g. {OURS}.model=dc_motor"
+                f"command line: {key}: a simulated robot takes only settings of {OURS}, e.g. {OURS}.model=dc_motor"
             )
     source, own = "command line", {}
     if contract is not None and not ideal:
@@ -70,7 +70,7 @@ class Motors:
     """Motors of D joints: delay, control law, torque limits and friction."""
 
     def __init__(self, robot: Robot, cfg: ActuatorConfig, dt: float, counted: float, seed: int = 1) -> None:
-        """Create motors with the step `dt` [s]; delays of `cfg` are in steps of `counted` [s] and drawn with `seed`."""
+        """Create motors with the step `dt` [s]. Delays of `cfg` count steps of `counted` [s], and are drawn with `seed`."""
         self._effort = robot.torque_limits
         self._stall, self._fastest = motor_numbers(robot, cfg)
         self._coulomb, breakaway, self._viscous = friction_numbers(robot, cfg)
@@ -82,7 +82,7 @@ class Motors:
         self._varies = cfg.delay_varies
         self.delay = self._draw()
         """Present delay of a command [steps]."""
-        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # from the last arrived command on
+        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # the last arrived command, then later ones
         self._network: ActuatorNetwork | None = None
         if cfg.network:
             weights = NetworkWeights.load(cfg.network)
@@ -100,7 +100,7 @@ class Motors:
         target, stiffness, damping = self._arrived(command)
         torques = stiffness * (target - q) - damping * dq
         if self._network is not None:
-            # The network was fitted with the gains of the policy, not with those of braking.
+            # The network was fitted with the policy's gains. It does not apply to braking, where the stiffness is 0.
             torques = np.where(self._by_network & (stiffness > 0.0), self._learned(target - q, dq), torques)
         if self._has_curve:
             share = dq / self._fastest
@@ -136,8 +136,8 @@ class SimulatedRobot:
     def __init__(
         self, robot: Robot, terrain: Terrain | None, sim: SimConfig, motors: Motors | None = None, scan: str = SCANS[0]
     ) -> None:
-        """Build the world with the solver options of `sim` and motors, by default ideal ones. `scan` is the setting
-        terrain.scan for the heights.
+        """Build the world with the solver options of `sim`. Motors are ideal by default. The setting terrain.scan, `scan`,
+        applies to the source `heights`.
         """
         self.robot, self._terrain = robot, terrain
         self.model = RobotScene(robot, terrain).model(sim)
@@ -186,7 +186,7 @@ class SimulatedRobot:
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
     def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
-        """Return the present measurements and the requested sources, `heights` at its points (P, 2)."""
+        """Return the present measurements and the requested sources. `sources` gives the points (P, 2) of `heights`."""
         data = self.data
         return Reading(
             time=float(data.time),

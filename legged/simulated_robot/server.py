@@ -1,4 +1,4 @@
-"""A simulated robot in real time, reached by UDP over a link with latency and losses."""
+"""A simulated robot in real time, reached by UDP over a network connection with latency and packet loss."""
 
 import random
 import socket
@@ -15,18 +15,18 @@ from legged.simulated_robot.robot import SimulatedRobot
 STATE_S = 0.004
 """Interval between states, rounded to physics steps [s]."""
 POSE_S = 0.04
-"""Interval between the poses that are kept for a film, at most `MOST_POSES` [s]."""
+"""Interval between the poses that are kept for a film [s]. At most `MOST_POSES` poses are kept."""
 MOST_POSES = 750
 SOURCE_S = 0.02
-"""Interval between the sources that are sent with states, rounded to states [s]."""
+"""Interval between states that include the sources, rounded to whole intervals of states [s]."""
 HOLD_S = 0.2
 """Time without a command after which motors brake with their present D gains [s]."""
 BEHIND_S = 0.1
-"""Largest delay of the simulated time that is made up for [s]."""
+"""Largest lag of the simulated time behind real time that the simulation makes up for [s]."""
 
 
 class Link:
-    """One direction of a link, which delays packets by `latency_s` [s] and loses a share `loss`, drawn from `seed`."""
+    """One direction of a network connection. It delays packets by `latency_s` [s] and loses a random share `loss` of them."""
 
     def __init__(self, latency_s: float, loss: float, seed: int) -> None:
         self._latency_s, self._loss, self._random = latency_s, loss, random.Random(seed)
@@ -53,7 +53,7 @@ class Server:
     """Real-time loop that steps a robot, sends its states and applies commands."""
 
     def __init__(self, robot: SimulatedRobot, latency_s: float = 0.0, loss: float = 0.0, seed: int = 1) -> None:
-        """Take a free port of this machine. Both directions of the link have a latency [s] and a share of lost packets."""
+        """Take a free port of this machine. Both directions delay packets by `latency_s` [s] and lose a share `loss`."""
         self.robot = robot
         self.poses: list[np.ndarray] = []
         """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
@@ -68,11 +68,11 @@ class Server:
         self._told: float | None = None
         self._gone = False
         self.skipped_s = 0.0
-        """Time by which the simulation fell behind and which it gave up [s]."""
+        """Sum of the lags that the simulation did not make up for [s]."""
 
     def run(self, seconds: float) -> dict[str, float | bool]:
-        """Run until the program says goodbye, or for so long [s]; return the robot's report and that of the link. Time stands
-        still until the first command has come.
+        """Run until the client says goodbye, but at most for `seconds`. Return the robot's report and the counts of packets.
+        The simulated time stands still until the first command has arrived.
         """
         dt = self.robot.model.opt.timestep
         state_steps, pose_steps = (max(1, round(each / dt)) for each in (STATE_S, POSE_S))
@@ -115,32 +115,32 @@ class Server:
                 break
             kind, sequence, body = udp.open_packet(data) or (None, 0, b"")
             if kind == udp.HELLO:
-                with suppress(ValueError, KeyError, TypeError, AttributeError):  # not from a program
+                with suppress(ValueError, KeyError, TypeError, AttributeError):  # packets of unknown senders
                     self._greet(client, udp.unpack_sources(body))
-            elif client == self._client and kind == udp.BYE:  # not subject to the link, so that the simulation always ends
+            elif client == self._client and kind == udp.BYE:  # never delayed or lost, so that the simulation always ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
                 self._in.put(now, (sequence, body))
         for sequence, body in self._in.take(now):
             with suppress(ValueError):
                 _, asked = udp.unpack_command(body)
-                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # no later one has arrived before
+                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # no newer one came before
                     self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
     def _greet(self, client: tuple[str, int], sources: dict[str, np.ndarray | None]) -> None:
-        """Answer a greeting; its sender receives the states from now on."""
+        """Answer a handshake. From now on, its sender receives the states."""
         if client != self._client:
             self._newest = 0
         self._client, self._sources = client, sources
         self._send(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)))
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
-        """Put a state into the link."""
+        """Queue a state for sending."""
         self._sequence += 1
         self._out.put(now, udp.packet(udp.STATE, self._sequence, udp.pack_state(self.robot.state(sources))))
 
     def _deliver(self, now: float) -> None:
-        """Send the packets that have passed the link."""
+        """Send the packets whose latency has passed."""
         for data in self._out.take(now):
             self._send(data)
 

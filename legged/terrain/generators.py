@@ -1,10 +1,10 @@
 """Tiles of terrain, made by one small NumPy function per type. Names and sizes are legged_gym's (arXiv 2109.11978).
 
-Every generator takes a `Tile` of zeros and the size of its difficulty, in metres or degrees, and fills in the heights of the
-cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
+Every generator takes a `Tile` of zeros and a size that depends on the difficulty, in metres or degrees, and fills in the
+heights of the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
 
-All other lengths here (treads, platforms, bumps, blocks) are for a robot that stands half a metre high. A tile of another
-`scale` has them multiplied by the scale.
+All other lengths here (treads, platforms, bumps, blocks) suit a robot that stands half a metre high. They are multiplied by
+the tile's `scale`.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ GRID = 0.45
 STONE_SIDES = (0.2, 0.5)
 """Shortest and longest side of a stone of rubble [m]."""
 NARROWEST_DITCH = 0.5
-"""Largest cell for a ditch whose width grows to 1 m [m]."""
+"""Largest edge of a cell for the type `gap`, whose ditch gets up to 1 m wide [m]."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Tile:
     """Width of a step of stairs [m]; None for the type's own. The scale does not multiply it."""
 
     def cells(self, metres: float) -> int:
-        """Return a length, times the tile's scale, in whole cells. Scales and cells have six digits, so a length may fall
-        short of a whole cell by a rounding error, which is ignored.
+        """Return the number of whole cells in a length [m] times the tile's scale. A cell that is incomplete by a rounding
+        error counts as whole, because scales and cells are rounded to six digits.
         """
         return int(metres * self.scale / self.cell + 1e-3)
 
     def from_centre(self) -> np.ndarray:
-        """Return (length, width) the distance of each cell's centre from the tile's, as the larger of |x| and |y| [m]."""
+        """Return the distance of each cell (length, width) from the tile's centre, as the larger of |x| and |y| [m]."""
         x, y = (np.abs(np.arange(n) - 0.5 * (n - 1)) * self.cell for n in self.heights.shape)
         return np.maximum(x[:, None], y[None, :])
 
@@ -104,8 +104,8 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
 
 
 def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
-    """Make rings of steps up to a platform in the middle (down, for a negative riser). The tread is the tile's, or else
-    `tread`, cut to whole cells.
+    """Make rings of steps up to a platform in the middle (down, for a negative riser). Steps are as wide as the tile's tread
+    or, if the tile has none, as `tread`, cut to whole cells.
     """
     width = max(1, tile.cells(tread if tile.tread is None else tile.tread / tile.scale))
     across = tile.cells(platform)
@@ -116,8 +116,8 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
 
 
 def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
-    """Make one step up around the platform, and one step down behind it."""
-    along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # in whole cells
+    """Make a raised ring around the platform: one step up and, a ledge further out, one step down."""
+    along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # cut to whole cells
     outer, inner = tile.middle(platform + 2.0 * along), tile.middle(platform)
     tile.heights[outer] = height
     tile.heights[inner] = 0.0
@@ -150,7 +150,7 @@ def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float 
 
 def gap(tile: Tile, width: float, platform: float = 3.0) -> None:
     """Make a ditch around the platform."""
-    across = tile.cells(width / tile.scale) * tile.cell / tile.scale  # in whole cells
+    across = tile.cells(width / tile.scale) * tile.cell / tile.scale  # cut to whole cells
     tile.heights[tile.middle(platform + 2.0 * across)] = -HOLE_DEPTH * tile.scale
     tile.heights[tile.middle(platform)] = 0.0
 
@@ -161,7 +161,7 @@ def pit(tile: Tile, depth: float, platform: float = 4.0) -> None:
 
 
 def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
-    """Make sine waves in both directions, level at the tile's edge: heights from -amplitude to amplitude."""
+    """Make sine waves along x and y with heights from -amplitude to amplitude. They fade out towards the tile's edge."""
     x, y = ((np.arange(n) + 0.5) * tile.cell / tile.scale for n in tile.heights.shape)
     pattern = np.sin(2.0 * np.pi * x[:, None] / length) + np.sin(2.0 * np.pi * y[None, :] / length)
     inside = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
@@ -172,9 +172,9 @@ def waves(tile: Tile, amplitude: float, length: float = WAVE) -> None:
 def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float = 1.2) -> None:
     """Stack overlapping blocks on the whole tile except its middle.
 
-    Sides are drawn from BLOCK_SIDES. Tops are at 0 to `height` in quarters of it, and a later block hides the ground below
-    it. The sum of the blocks' areas is `cover` times the tile's. So a robot meets a face of up to `height` every few steps,
-    and hardly ever a level stretch of its own length.
+    Sides are drawn from BLOCK_SIDES. Tops are at 0, 1, 2, 3 or 4 quarters of `height`. Where blocks overlap, the later one
+    counts. The sum of the blocks' areas is `cover` times the tile's. So a robot meets a face of up to `height` every few
+    steps, and hardly ever a level stretch as long as the robot.
     """
     rows, columns = tile.heights.shape
     left = cover * rows * columns
@@ -187,8 +187,8 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
 
 
 def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = GRID) -> None:
-    """Cover the tile with squares, each at a quarter of the height between -height / 2 and height / 2, after Isaac Lab's
-    boxes. Steps up and down follow each other more closely than on stairs and obstacles, in no regular order.
+    """Cover the tile with squares as Isaac Lab's boxes do. Each square is at -1/2, -1/4, 0, 1/4 or 1/2 of `height`. Steps up
+    and down follow each other more closely than on stairs and obstacles, in no regular order.
     """
     across = max(1, tile.cells(side))
     rows, columns = (-(-n // across) for n in tile.heights.shape)
@@ -202,7 +202,7 @@ def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB,
     across, every, inner = max(1, tile.cells(width)), max(2, tile.cells(spacing)), tile.cells(platform)
     rows, columns = tile.heights.shape
     innermost = max(0, (min(rows, columns) - inner) // 2) - across
-    for first in sorted(range(innermost, -1, -every)):  # from the edge inward: each ring clears the ground inside it
+    for first in sorted(range(innermost, -1, -every)):  # from the edge inward, because each ring clears the ground inside it
         last = first + across
         tile.heights[first : rows - first, first : columns - first] = height
         tile.heights[last : rows - last, last : columns - last] = 0.0
@@ -211,7 +211,7 @@ def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB,
 def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0) -> None:
     """Cover the tile except its middle with slabs of stone.
 
-    Sides are drawn from STONE_SIDES, edges lie at any angle, and tops are at quarters of `height` up to it. Where stones
+    Sides are drawn from STONE_SIDES, edges lie at any angle, and tops are at 1, 2, 3 or 4 quarters of `height`. Where stones
     overlap, the higher one counts. The sum of the stones' areas is `cover` times the tile's. So faces lie at any angle, with
     ragged edges (cells are square), and few tops are large enough for a whole foot.
     """
@@ -238,9 +238,9 @@ class TerrainType:
     """A type of tile: its generator and the size of its difficulty."""
 
     generate: Callable[[Tile, float], None]
-    """Generator; its second argument is the size below."""
+    """Generator, called with a tile and a size in `unit`."""
     size: Callable[[float], float]
-    """Difficulty (0 is the easiest of training, 1 is one row beyond the hardest) -> size at scale 1, in `unit`."""
+    """Difficulty -> size at scale 1, in `unit`. Training begins at difficulty 0; difficulty 1 is one row past the hardest."""
     unit: str
     what: str
     """Name of the size."""
@@ -253,8 +253,8 @@ class TerrainType:
     finest: tuple[float, str] | None = None
     """Length of the smallest part of a tile of scale 1 [m], and its name; cells must not be larger."""
     exact: bool = False
-    """True if that part must be a whole number of cells, since another size of cells would change the ground. Evaluations
-    check it.
+    """True if the smallest part must be a whole number of cells, because other cells would change the ground. Evaluations
+    check this.
     """
 
     def sized(self, difficulty: float, scale: float) -> float:
@@ -279,7 +279,7 @@ LARGEST, STEEPEST = 100.0, 80.0
 
 
 def _angle(difficulty: float) -> float:
-    """Return the angle of the slope 0.4 * difficulty (rise over run) [degrees]."""
+    """Return the angle of a slope whose rise over run is 0.4 * difficulty [degrees]."""
     return degrees(atan(0.4 * difficulty))
 
 
@@ -297,7 +297,7 @@ OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
 
 def narrow_stairs(up: float) -> TerrainType:
-    """Return stairs with the treads of a house, around a platform at their top, or at their bottom if `up` is -1."""
+    """Return the type of stairs with treads as in a house. The platform is at their top, or at their bottom if `up` is -1."""
     return TerrainType(
         lambda tile, size: stairs(tile, up * size, tread=NARROW_TREAD),
         _riser,
@@ -369,7 +369,7 @@ def terrain_type(name: str, where: str) -> TerrainType:
 
 
 def terrain_types(flag: str, text: str) -> list[str]:
-    """Return the names in a comma-separated list, the value of `flag`: 'gap, pit' -> ['gap', 'pit'].
+    """Return the names in `text`, the comma-separated value of `flag`: 'gap, pit' -> ['gap', 'pit'].
 
     Raises:
         ConfigError: a name is not a type, or is given twice.

@@ -10,8 +10,8 @@ CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 @dataclass(frozen=True)
 class HeightMap:
-    """Terrain of X x Y cells. Within a cell the height is bilinear in its four corners; where corners of neighbours differ,
-    there is a vertical face. Outside the map the cells at the border continue.
+    """Terrain of X x Y cells. Within a cell the height is interpolated bilinearly from the four corners. Where corners of
+    neighbouring cells differ, there is a vertical face. Outside the map the cells at the border continue.
     """
 
     heights: np.ndarray
@@ -28,8 +28,8 @@ class HeightMap:
         """Return the height map of the cell heights `heights` (X, Y), with cells joined where no face is between them.
 
         `steepest` (X, Y) is the largest slope (rise over run) that stays a slope. Two cells have a vertical face between them
-        if their slope exceeds the smaller of their two values. legged_gym makes such faces from a triangle mesh by one
-        threshold for all types.
+        if the slope between their centres exceeds the smaller of their two values. legged_gym makes these faces from a
+        triangle mesh by one threshold for all types.
         """
         return cls(heights, join(heights, cell * steepest), cell, origin)
 
@@ -39,13 +39,13 @@ class HeightMap:
         return self.heights.shape[0] * self.cell, self.heights.shape[1] * self.cell
 
     def index(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indices of the cells that hold the world points; for points outside the map, of the nearest cells."""
+        """Return the indices of the cells that contain the world points, or that are nearest to points outside the map."""
         i = np.floor((np.asarray(x) - self.origin[0]) / self.cell).astype(int)
         j = np.floor((np.asarray(y) - self.origin[1]) / self.cell).astype(int)
         return np.clip(i, 0, self.heights.shape[0] - 1), np.clip(j, 0, self.heights.shape[1] - 1)
 
     def height_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return the height of the surface at world points [m]; on a vertical face, that of the cell on its far side."""
+        """Return the height of the surface at world points [m]. On a vertical face, the cell of larger index counts."""
         i, j = self.index(x, y)
         u = np.clip((np.asarray(x) - self.origin[0]) / self.cell - i, 0.0, 1.0)
         v = np.clip((np.asarray(y) - self.origin[1]) / self.cell - j, 0.0, 1.0)
@@ -55,7 +55,7 @@ class HeightMap:
         return low * (1.0 - v) + high * v
 
     def ceiling(self, reach: int) -> np.ndarray:
-        """Return (X, Y) float32: the highest corner among the cells within `reach` in x and y."""
+        """Return (X, Y) float32: the highest corner of the cells that are at most `reach` cells away along x and y [m]."""
         top = self.corners.max(axis=2)
         for axis in (0, 1):
             padded = np.pad(top, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
@@ -64,8 +64,8 @@ class HeightMap:
         return top.astype(np.float32)
 
     def scan_map(self, scan: str) -> np.ndarray:
-        """Return (X, Y) float32: the measured height of a point in each cell, by `scan` (terrain.scan). "lowest" takes the
-        lowest of the cell and its next neighbours in x and y, as legged_gym's height measurements do at a vertical face.
+        """Return (X, Y) float32: the height that a height scan measures in each cell [m]. `scan` is the setting terrain.scan.
+        "lowest" takes the lowest of the cell and its next neighbours in x and y, as legged_gym does at a vertical face.
         """
         if scan == "own":
             return self.heights.astype(np.float32)
@@ -75,10 +75,10 @@ class HeightMap:
 
 
 def join(heights: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return (X, Y, 4) corners: at each lattice point, joined cells around it share the mean of their heights.
+    """Return the corner heights (X, Y, 4) [m]. Cells that are joined at a lattice point have their mean height there.
 
-    Two neighbours are joined if they differ by at most the smaller of their `rise` [m]. Cells that are joined through a
-    common neighbour around the point count as joined too.
+    Two neighbours are joined if their heights differ by at most the smaller of their `rise` [m]. Cells that are joined
+    through a common neighbour around the point count as joined too.
     """
     h = np.pad(heights, 1, mode="edge")
     r = np.pad(rise, 1, mode="edge")

@@ -13,11 +13,11 @@ from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
-"""Side of the square in the middle of a tile, at scale 1, whose highest point is the height at which robots start [m]."""
+"""Side at scale 1 of the square in the middle of a tile. Robots start at the height of the square's highest point [m]."""
 EDGE = 1.0
-"""Distance from the end of the map at which a robot has left it [m]."""
+"""A robot that is nearer than this to the end of the map has left the map [m]."""
 WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
-"""Difficulties of a terrain without a curriculum, one per row: those of the upper rows of ten."""
+"""Difficulties from which each row draws one if the terrain has no curriculum."""
 MOST_TILES = 10_000
 """Largest number of tiles; each is generated separately."""
 MOST_CELLS = 2**24
@@ -51,7 +51,7 @@ class Terrain:
 
     @classmethod
     def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
-        """Return the terrain of a training: columns are types by their shares, and rows get harder."""
+        """Return the terrain for training. Each type has columns according to its share. In a curriculum rows get harder."""
         columns = column_types(cfg.proportions, cfg.num_cols)
         rng = np.random.default_rng(seed)
         rows = []
@@ -62,7 +62,7 @@ class Terrain:
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """Return a terrain of the given tiles; of `cfg` only lengths, the scale and the slope threshold are used."""
+        """Return a terrain of the given tiles. From `cfg` it takes only lengths, the scale and the slope threshold."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -134,8 +134,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     """Check all values of a terrain's configuration.
 
     Raises:
-        ConfigError: a value is wrong. The text names the field, the contradicting value, and the origin of each from
-            `origins`.
+        ConfigError: a value is wrong. The text names the field, the value that it contradicts, and from `origins` where both
+            were set.
     """
     if cfg.mesh_type == "plane":
         return
@@ -164,8 +164,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:
             raise ConfigError(
-                f"{where(f'proportions.{name}')}: {share:g} of {among('num_cols')} columns is less than one;"
-                " ask for more columns or leave the type out"
+                f"{where(f'proportions.{name}')}: a share of {share:g} of {among('num_cols')} columns is less than one"
+                " column; ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
         finest = kind.finest[0] * cfg.scale if kind.finest else float("inf")
@@ -189,8 +189,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     side = min(cfg.terrain_length, cfg.terrain_width)
     if cfg.spawn_range >= 0.5 * side:
         raise ConfigError(
-            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of a tile of {side:g} m,"
-            f" outside it ({among('terrain_length')}, {among('terrain_width')})"
+            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of their tile, and so"
+            f" outside this tile of {side:g} m ({among('terrain_length')}, {among('terrain_width')})"
         )
     if cfg.border_size < 2.0 * EDGE:
         raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")

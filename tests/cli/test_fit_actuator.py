@@ -250,7 +250,7 @@ def test_an_lstm_in_a_task_is_torchs():
         ({"dt": None}, "'dt' is missing"),
         ({"dt": np.array(0.0)}, "dt: must be above 0"),
         ({"dt": np.zeros(0)}, "dt: expected a number, got (0,)"),
-        ({"dt": None, "time": np.arange(1600.0), "run": np.arange(1600)}, "run: no two samples in a row are of one run"),
+        ({"dt": None, "time": np.arange(1600.0), "run": np.arange(1600)}, "run: no two consecutive samples have the same"),
         ({"dt": None, "time": np.arange(1600.0) ** 1.1}, "time: samples are not evenly spaced"),
         ({"stiffness": np.zeros(5)}, "stiffness: expected a number or (2,)"),
         ({"stiffness": np.array(-80.0)}, "stiffness: must be 0 or more, got -80"),

@@ -175,7 +175,7 @@ def test_the_command_gives_the_robot_what_the_contract_says(contract):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        (["sim.dt=0.001"], "command line: sim.dt: only control.actuator can be changed of a simulated robot"),
+        (["sim.dt=0.001"], "command line: sim.dt: a simulated robot takes only settings of control.actuator"),
         (["control.actuator.modell=dc_motor"], "unknown key 'modell'; did you mean 'model'?"),
         (["control.actuator.stall_torque={WHEEL: 3}"], "control.actuator.stall_torque: "),
         (["control.actuator.stall_torque={KFE: 3}"], "set control.actuator.model to dc_motor"),

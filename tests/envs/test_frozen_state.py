@@ -153,8 +153,8 @@ class WritesHalf(Task):
 
 
 FROZEN = {
-    SwapsBuffers: r"reads self\.\w+, which was another tensor",
-    WritesHalf: r"reads self\.last_foo, which was another tensor",
+    SwapsBuffers: r"reads self\.\w+, but the previous step read another tensor",
+    WritesHalf: r"reads self\.last_foo, but the previous step read another tensor",
     Counts: r"self\.n changed from 5 to 6",
     Schedules: r"self\.n changed from 5 to 6",
     ChangesMode: r"self\.mode changed from 'walk' to 'run'",
@@ -163,12 +163,12 @@ FROZEN = {
     DrawsByNumpy: r"draws from np\.random",
     DrawsByPython: "draws from Python's random",
     DrawsByItsGenerator: "calls mul",
-    CountsElsewhere: r"calls mul\(3\) where the step before called mul\(2\)",
-    CountsInATensor: "other numbers than the step before",
+    CountsElsewhere: r"calls mul\(3\) where the previous step called mul\(2\)",
+    CountsInATensor: "numbers that differ from the previous step's",
     FillsWithACount: "calls ",
-    Rebinds: r"reads self\.last_foo, which was another tensor in the step before.*self\.last_foo\.copy_",
-    RebindsInATable: r"reads self\.table, which was another",
-    KeepsSteps: r"reads self\.steps, which was another",
+    Rebinds: r"reads self\.last_foo, but the previous step read another tensor there.*self\.last_foo\.copy_",
+    RebindsInATable: r"reads self\.table, but the previous step read another",
+    KeepsSteps: r"reads self\.steps, but the previous step read another",
 }
 
 
