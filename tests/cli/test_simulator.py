@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from helpers import CALM, ENGINE, HANG_S, call
 
-from legged.cli.deploy import robot as simulated_robot
-from legged.cli.deploy import sim
+from legged.cli import deploy
 from legged.cli.fit_actuator import fit_actuator
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.udp import UdpRobot
@@ -208,7 +207,7 @@ def test_sources_come_every_fifth_state_at_any_time_step():
 def test_a_wrong_flag_ends_the_command_with_one_line(flags, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     policy = [] if flags == ["nobody"] else ["anymal_c_flat"]
-    assert call(sim.sim.main, [*policy, *flags]) == 2
+    assert call(deploy.sim.main, [*policy, *flags]) == 2
     shown = capsys.readouterr().err
     assert shown.startswith(says)
     assert len(shown.splitlines()) == 1
@@ -223,7 +222,7 @@ def test_a_film_has_a_picture_for_each_pose(tmp_path):
     np.save(tmp_path / "poses.npy", [[0.04 * i, *pose] for i in range(4)])
     rows = {"times": np.array([0.0, 0.1]), "state": np.array([1, 2]), "states": np.array(["idle", "damping", "stand"])}
     np.savez(tmp_path / "log.npz", **rows)
-    sim.make_film(robot, None, tmp_path)
+    deploy.make_film(robot, None, tmp_path)
     frames = iio.imread(tmp_path / "film.mp4")
     assert frames.shape == (4, 360, 640, 3)
     assert frames.std() > 10.0
@@ -236,13 +235,13 @@ def test_a_run_too_short_for_a_film_has_none_and_says_so(count, tmp_path, capsys
     np.save(tmp_path / "poses.npy", np.array([[0.04, *robot.default_qpos]] * count))
     np.savez(tmp_path / "log.npz", times=np.array([0.0]), state=np.array([0]), states=np.array(["idle"]))
     (tmp_path / "film.mp4").write_bytes(b"of the run before")
-    sim.make_film(robot, None, tmp_path)
+    deploy.make_film(robot, None, tmp_path)
     assert "no film, because the run was too short" in capsys.readouterr().out
     assert not (tmp_path / "film.mp4").exists()
 
 
 def test_an_unknown_robot_is_not_simulated(capsys):
-    assert call(simulated_robot.robot.main, ["anymal_x"]) == 2
+    assert call(deploy.robot.main, ["anymal_x"]) == 2
     assert "error: ROBOT: there is no robot 'anymal_x'" in capsys.readouterr().err
 
 

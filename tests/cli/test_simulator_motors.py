@@ -9,8 +9,7 @@ import pytest
 import torch
 from helpers import call, small_task
 
-from legged.cli.deploy import robot as simulated_robot
-from legged.cli.deploy import sim
+from legged.cli import deploy
 from legged.config.schema import ActuatorConfig, LeggedControlConfig, SimConfig
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError
@@ -154,8 +153,8 @@ def test_the_network_of_the_motors_travels_with_the_policy(tmp_path):
 
 
 def test_the_command_gives_the_robot_what_the_contract_says(contract):
-    args = simulated_robot.robot.build_parser().parse_intermixed_args(["anymal_c", "control.actuator.delay=[4, 4]"])
-    robot, built = simulated_robot.motors_of(args, ROBOT, contract)
+    args = deploy.robot.build_parser().parse_intermixed_args(["anymal_c", "control.actuator.delay=[4, 4]"])
+    robot, built = deploy.motors_of(args, ROBOT, contract)
     assert built.delay == 10
     simulated = SimulatedRobot(robot, None, SimConfig(dt=0.002), built)
     rotors = simulated.model.dof_armature[list(ROBOT.qvel_columns)]
@@ -166,9 +165,9 @@ def test_the_command_gives_the_robot_what_the_contract_says(contract):
         assert not simulated.data.ctrl.any()
     simulated.step()
     assert simulated.data.ctrl.any()
-    assert simulated_robot.scan_of(None) == "lowest"
+    assert deploy.scan_of(None) == "lowest"
     term = SimpleNamespace(scan="highest")
-    assert simulated_robot.scan_of(SimpleNamespace(sources={"heights": term})) == "highest"
+    assert deploy.scan_of(SimpleNamespace(sources={"heights": term})) == "highest"
 
 
 @pytest.mark.slow
@@ -184,11 +183,11 @@ def test_the_command_gives_the_robot_what_the_contract_says(contract):
 )
 def test_wrong_changes_end_both_commands_with_one_line(changes, says, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert call(simulated_robot.robot.main, ["anymal_c", *changes]) == 2
+    assert call(deploy.robot.main, ["anymal_c", *changes]) == 2
     shown = capsys.readouterr().err
     assert says in shown
     assert len(shown.splitlines()) == 1
-    assert call(sim.sim.main, ["anymal_c_flat", *changes]) == 2
+    assert call(deploy.sim.main, ["anymal_c_flat", *changes]) == 2
     assert says in capsys.readouterr().err
 
 

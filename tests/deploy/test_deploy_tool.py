@@ -11,7 +11,7 @@ from helpers import HANG_S, call, tiny_run
 from importing_fixtures import urdf
 
 from legged import registry
-from legged.cli.deploy import sim
+from legged.cli import deploy
 from legged.cli.robot import add
 from legged.errors import RunError
 
@@ -33,8 +33,8 @@ def run(policy_folder, tmp_path, monkeypatch):
             source = program if "legged.deploy" in command else simulator
             return starts([sys.executable, "-c", source, *command[3:]], **settings)
 
-        monkeypatch.setattr(sim.subprocess, "Popen", start)
-        return call(sim.sim.main, [str(policy_folder), "--out", str(tmp_path)])
+        monkeypatch.setattr(deploy.subprocess, "Popen", start)
+        return call(deploy.sim.main, [str(policy_folder), "--out", str(tmp_path)])
 
     return run
 
@@ -70,12 +70,12 @@ def test_a_program_that_does_not_end_leaves_no_simulator_behind(policy_folder, t
         program.stdout.readline()
         raise RunError("what goes wrong here")
 
-    monkeypatch.setattr(sim.subprocess, "Popen", start)
-    monkeypatch.setattr(sim, "_wait", fails)
-    monkeypatch.setattr(sim, "END_S", 0.2)
+    monkeypatch.setattr(deploy.subprocess, "Popen", start)
+    monkeypatch.setattr(deploy, "_wait", fails)
+    monkeypatch.setattr(deploy, "END_S", 0.2)
     try:
         with pytest.raises(subprocess.TimeoutExpired):
-            sim.sim.main([str(policy_folder), "--out", str(tmp_path)])
+            deploy.sim.main([str(policy_folder), "--out", str(tmp_path)])
         assert started[0].poll() is not None
     finally:
         for process in started:
@@ -93,7 +93,7 @@ def test_a_program_that_refuses_ends_the_simulator_at_once(code, run, capsys):
 
 
 def test_a_policy_without_commands_is_none_for_a_robot(capsys):
-    assert call(sim.sim.main, ["half_cheetah"]) == 2
+    assert call(deploy.sim.main, ["half_cheetah"]) == 2
     assert "POLICY: 'half_cheetah' follows no commands" in capsys.readouterr().err
 
 
@@ -115,23 +115,23 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
     moved away from there, and where a run is named whose task nobody knows, an error says what to name.
     """
     simulated = []
-    monkeypatch.setattr(sim, "_run_both", lambda args, exported, robot, folder: (simulated.append(robot), (0, None))[1])
+    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (simulated.append(robot), (0, None))[1])
 
     def error(*flags):
-        assert call(sim.sim.main, [*map(str, flags)]) == 2
+        assert call(deploy.sim.main, [*map(str, flags)]) == 2
         return capsys.readouterr().err
 
     assert "POLICY: logs/toy_flat/" in (said := error(own_run))
     assert "was trained on a user-defined task, 'toy_flat': --import FILE" in said
     robot = Path("mine/toy").resolve()
-    assert call(sim.sim.main, ["mine/toy_flat.yaml"]) == 0
-    assert call(sim.sim.main, [str(own_run / "exported")]) == 0
+    assert call(deploy.sim.main, ["mine/toy_flat.yaml"]) == 0
+    assert call(deploy.sim.main, [str(own_run / "exported")]) == 0
     assert simulated == [str(robot)] * 2
     (own_run / "exported").rename("moved")
     assert "moved/policy.json: robot: 'toy' does not come with this package; give its folder with --robot FOLDER" in error(
         "moved"
     )
-    assert call(sim.sim.main, ["moved", "--robot", "mine/toy"]) == 0
+    assert call(deploy.sim.main, ["moved", "--robot", "mine/toy"]) == 0
     assert simulated[-1] == str(robot)
 
 
@@ -139,12 +139,12 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
 def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys):
     """Its export was once taken for its newest policy, whatever had been learned since. Who names the export gets it."""
     folder = tiny_run(iterations=1)
-    monkeypatch.setattr(sim, "_run_both", lambda args, exported, robot, folder: (0, None))
+    monkeypatch.setattr(deploy, "_run_both", lambda args, exported, robot, folder: (0, None))
     policy, (checkpoint,) = folder / "exported" / "policy.onnx", folder.glob("model_*.pt")
 
     def says(name):
         capsys.readouterr()
-        assert call(sim.sim.main, [str(name)]) == 0
+        assert call(deploy.sim.main, [str(name)]) == 0
         return "exported" in capsys.readouterr().out
 
     assert says(folder)
@@ -156,7 +156,7 @@ def test_a_run_that_has_gone_on_is_exported_again(workplace, monkeypatch, capsys
 
 
 def test_a_policy_that_is_not_there_is_named(workplace, capsys):
-    assert call(sim.sim.main, ["nonsense"]) == 2
+    assert call(deploy.sim.main, ["nonsense"]) == 2
     assert capsys.readouterr().err.startswith("error: POLICY: there is no task and no run 'nonsense'")
-    assert call(sim.sim.main, ["nonsense.yaml"]) == 2
+    assert call(deploy.sim.main, ["nonsense.yaml"]) == 2
     assert capsys.readouterr().err == "error: POLICY: there is no file 'nonsense.yaml'\n"

@@ -1,4 +1,4 @@
-"""`legged deploy sim`: the robot's program against a simulated robot."""
+"""`legged deploy`: a simulated robot behind UDP, and the robot's program against it."""
 
 import argparse
 import json
@@ -11,25 +11,37 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.cli.deploy.robot import LISTENING, POSES, REPORT, SIMULATION, check_simulation, motors_of, terrain_of
 from legged.commandline.arguments import POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
-from legged.config import LeggedConfig
+from legged.config import LeggedConfig, parse_override
+from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
-from legged.deploy.contract import Contract, read_contract
+from legged.deploy.contract import SCANS, Contract, read_contract
+from legged.deploy.pace import take_priority
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
+from legged.mdp.actuator import with_rotors
 from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import IMPORT, argument
-from legged.process.paths import exists, ready_to_write, relative
+from legged.process.command_parser import IMPORT, argument, check_between
+from legged.process.paths import exists, make_folder, ready_to_write, relative, replacing, write_text
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.rendering.camera import Camera, Follower, caption, size_of
 from legged.rendering.scene import display_model
 from legged.robots.robot import Robot, load_robot
-from legged.terrain import Terrain
+from legged.simulated_robot.robot import Motors, SimulatedRobot, motors_config
+from legged.simulated_robot.server import Server
+from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
+LISTENING = "listening at "
+"""Beginning of the line with the address."""
+REPORT, POSES = "report.json", "poses.npy"
+"""Files in the folder of a run."""
+PRIORITY = 10
+"""Priority below the program's."""
+BORDER = 10.0
+"""Width of the level ground around the tile [m]."""
 ROOM_MB = 16.0
 """Disk space for the exported policy and the log [MiB]."""
 END_S = 20.0
@@ -43,6 +55,110 @@ AWAY = 3.45
 """Distance of the camera, in lengths of the robot."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
+SIMULATION = (
+    argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default"),
+    argument("--size", type=float, help="size of the tile, in the unit of its type, e.g. the height of a step [m]"),
+    argument("--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are whole cells; default 0.1"),
+    argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002"),
+    argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0"),
+    argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0"),
+    argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1"),
+    argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with"),
+    argument(
+        "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
+    ),
+)
+"""Arguments of the simulation."""
+
+
+@sub_command(
+    "legged deploy robot anymal_c",
+    "legged deploy robot go2 --terrain stairs_up --size 0.12 --latency 0.01 --loss 0.01",
+    "legged deploy robot go2 control.actuator.model=dc_motor 'control.actuator.delay=[5, 10]'",
+    arguments=(
+        argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
+        *SIMULATION,
+        argument("--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"),
+        argument(
+            "--out",
+            type=Path,
+            help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute",
+        ),
+        argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600"),
+    ),
+)
+def robot(args: argparse.Namespace) -> int:
+    """Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
+
+    C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
+    packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT`
+    runs a policy on it.
+    """
+    check_simulation(args)
+    if not args.seconds > 0.0:
+        raise ConfigError(f"--seconds: must be above 0, got {args.seconds:g}")
+    if args.out is not None:
+        ready_to_write(args.out)
+        make_folder(args.out)
+    loaded = load_robot(args.robot, "ROBOT")
+    sim = SimConfig(dt=args.sim_dt, iterations=100, ls_iterations=50)
+    contract = None if args.contract is None else read_contract(args.contract)
+    (rotored, motors), scan = motors_of(args, loaded, contract), scan_of(contract)
+    server = Server(SimulatedRobot(rotored, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
+    take_priority(PRIORITY)  # motors and sensors of a real robot do not wait for other processes either
+    print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
+    report = server.run(args.seconds)
+    if args.out is not None:
+        with replacing(args.out / POSES) as part:
+            np.save(part, np.array(server.poses))
+        write_text(args.out / REPORT, json.dumps(report, indent=1))
+    print(json.dumps(report), flush=True)
+    return 0
+
+
+def check_simulation(args: argparse.Namespace) -> None:
+    """Check the numbers of the simulation's flags.
+
+    Raises:
+        ConfigError: a number is out of bounds.
+    """
+    largest = 0.0
+    if args.terrain is not None:
+        largest = terrain_type(args.terrain, "--terrain").largest
+    elif args.size is not None:
+        raise ConfigError("--size: a plane has no size; name a type of tiles with --terrain")
+    check_between("--size", args.size, 0.0, largest)
+    check_between("--cell", args.cell, 0.02, 1.0)
+    check_between("--sim-dt", args.sim_dt, 1e-4, 0.02)
+    check_between("--latency", args.latency, 0.0, 1.0)
+    check_between("--loss", args.loss, 0.0, 0.9)
+
+
+def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
+    """Return the robot with the motors, rotors and control laws that the flags choose; by default those of the training of
+    the policy in `contract`.
+
+    Raises:
+        ConfigError: as `motors_config`.
+    """
+    changes = [parse_override(text) for text in args.overrides]
+    cfg, counted = motors_config(robot, contract, args.ideal_motors, changes, args.sim_dt)
+    return with_rotors(robot, cfg), Motors(robot, cfg, args.sim_dt, counted, args.seed)
+
+
+def scan_of(contract: Contract | None) -> str:
+    """Return the rule of height measurements (terrain.scan) for the policy in `contract`."""
+    term = None if contract is None else contract.sources.get("heights")
+    return SCANS[0] if term is None else term.scan
+
+
+def terrain_of(args: argparse.Namespace) -> Terrain | None:
+    """Return the terrain that the flags choose: one tile with level ground around it; None for a plane."""
+    if args.terrain is None:
+        return None
+    cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)
+    size = TERRAIN_TYPES[args.terrain].sized(0.5, cfg.scale) if args.size is None else args.size
+    return Terrain.of_tiles([[TileSpec(args.terrain, size)]], cfg, np.random.default_rng(args.seed))
 
 
 @sub_command(
@@ -80,7 +196,12 @@ def sim(args: argparse.Namespace) -> int:
     code, report = _run_both(args, exported, str(robot.folder), folder)
     if report is None:
         return code
-    print(f"{relative(folder / REPORT)}: {_told(report)}")
+    lost = 100.0 * report["lost"] / max(1, report["sent"] + report["received"])
+    print(
+        f"{relative(folder / REPORT)}: {'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s,"
+        f" {report['distance']:.2f} m away, {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad,"
+        f" {lost:.1f} % of packets lost"
+    )
     if args.film:
         make_film(robot, terrain_of(args), folder)
     return code
@@ -189,15 +310,6 @@ def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
     """Return the given and default values of the named options as flags."""
     given = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     return [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
-
-
-def _told(report: dict[str, Any]) -> str:
-    """Return a summary of the robot's report in one line."""
-    lost = 100.0 * report["lost"] / max(1, report["sent"] + report["received"])
-    return (
-        f"{'fell' if report['fell'] else 'did not fall'}, {report['time']:.1f} s, {report['distance']:.2f} m away,"
-        f" {report['climbed']:+.2f} m higher, largest lean {report['largest_lean']:.2f} rad, {lost:.1f} % of packets lost"
-    )
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
