@@ -96,12 +96,11 @@ class ActuatorLog:
             rows = np.flatnonzero(self.run == number)
             at = np.arange(0.0, (len(rows) - 1) * self.dt * (1.0 + 1e-9), dt) / self.dt
             before = np.minimum(np.floor(at + 1e-6).astype(int), len(rows) - 1)
-            after, share = np.minimum(before + 1, len(rows) - 1), np.clip(at - before, 0.0, 1.0)[:, None]
             parts["run"].append(np.full(len(at), number))
             parts["target"].append(self.target[rows[before]])
             for name in MEASURED[1:]:
-                values = getattr(self, name)[rows]
-                parts[name].append((1.0 - share) * values[before] + share * values[after])
+                joints = getattr(self, name)[rows].T
+                parts[name].append(np.stack([np.interp(at, np.arange(len(rows)), values) for values in joints], axis=1))
         joined: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
         return replace(self, dt=dt, **joined)
 

@@ -7,16 +7,14 @@ the torque; the delay with the smallest error is chosen.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mujoco.minimize import least_squares
 
 from legged.fitting.log import ActuatorLog
 
 SEEN = 0.002
 """Share of samples at the motor's limit below which the limit is not identified."""
-MOST_ITERATIONS = 60
-DAMPING, EASIER, HARDER = 1e-3, 0.3, 4.0
-"""Levenberg-Marquardt: initial damping, and its factors after an accepted and after a rejected step."""
-FINEST = 1e-9
-"""Relative improvement at which the search ends."""
+PEAK, LIMITS = ("breakaway", "stribeck_velocity"), ("stall_torque", "no_load_speed")
+"""Parameters of a friction peak and of a motor's torque-speed line, which a fit may leave out."""
 MOST_SAMPLES = 40_000
 """Number of samples in each of the last searches, spread over the log."""
 ROUGHLY = 4_000
@@ -58,14 +56,14 @@ class Drive:
     def torques(self, error: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Return torques [N m] for errors of the delayed target [rad] and velocities [rad/s]."""
         asked = self.stiffness * error - self.damping * velocity
+        low: float | np.ndarray = -self.effort
+        high: float | np.ndarray = self.effort
         if np.isfinite(self.stall_torque):
             fastest = self.no_load_speed * (1.0 + min(self.effort / self.stall_torque, 1e6))
             share = np.clip(velocity, -fastest, fastest) / self.no_load_speed
-            low = np.maximum(self.stall_torque * (-1.0 - share), -self.effort)
-            asked = np.clip(asked, low, np.minimum(self.stall_torque * (1.0 - share), self.effort))
-        else:
-            asked = np.clip(asked, -self.effort, self.effort)
-        return asked - self.friction(velocity)
+            low = np.maximum(self.stall_torque * (-1.0 - share), low)
+            high = np.minimum(self.stall_torque * (1.0 - share), high)
+        return np.clip(asked, low, high) - self.friction(velocity)
 
     def friction(self, velocity: np.ndarray) -> np.ndarray:
         """Return the friction torque [N m]."""
@@ -97,6 +95,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     """
     every = np.flatnonzero(~log.held_out)
     effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
+    gains = ("viscous",) if log.has_gains else ("stiffness", "damping")
 
     def search(
         samples: float, start: Drive, limited: bool, most: int = MOST_SAMPLES, peaked: bool = True
@@ -104,7 +103,8 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
         rows = every[:: max(1, round(len(every) * len(log.joint_names) / most))]
         position, velocity, torque = (getattr(log, name)[rows].ravel() for name in ("position", "velocity", "torque"))
         error = delayed(log, samples)[rows].ravel() - position
-        return _search(replace(start, delay=samples * log.dt), error, velocity, torque, _free(log, limited, peaked))
+        free = (*gains, "coulomb", *(PEAK if peaked else ()), *(LIMITS if limited else ()))
+        return _search(replace(start, delay=samples * log.dt), error, velocity, torque, free)
 
     # First search the delay in whole samples, with and without the motor's limit.
     start = _start(log, effort)
@@ -140,14 +140,6 @@ def _start(log: ActuatorLog, effort: float) -> Drive:
     return Drive(float(stiffness), float(damping), dry, dry, 2.0 * SMOOTHING, 0.05 * damping + 1e-6, effort=effort)
 
 
-def _free(log: ActuatorLog, limited: bool, peaked: bool) -> tuple[str, ...]:
-    """Return the names of the free parameters; without a peak, breakaway friction equals Coulomb friction."""
-    gains = ("viscous",) if log.has_gains else ("stiffness", "damping")
-    limits = ("stall_torque", "no_load_speed") if limited else ()
-    peak = ("breakaway", "stribeck_velocity") if peaked else ()
-    return (*gains, "coulomb", *peak, *limits)
-
-
 def _search(
     start: Drive, error: np.ndarray, velocity: np.ndarray, torque: np.ndarray, free: tuple[str, ...]
 ) -> tuple[float, Drive]:
@@ -161,26 +153,9 @@ def _search(
         values.setdefault("breakaway", values["coulomb"])
         return replace(start, **values)
 
-    def residual(x: np.ndarray) -> np.ndarray:
-        return drive(x).torques(error, velocity) - torque
+    def residual(points: np.ndarray) -> np.ndarray:
+        return np.stack([drive(x).torques(error, velocity) - torque for x in points.T], axis=1) / len(torque) ** 0.5
 
-    x = np.log([getattr(start, name) for name in free])
-    left = residual(x)
-    cost, weight = float(left @ left), DAMPING
-    for _ in range(MOST_ITERATIONS):
-        jacobian = np.stack([(residual(x + 1e-4 * unit) - left) / 1e-4 for unit in np.eye(len(x))], axis=1)
-        square, slope = jacobian.T @ jacobian, jacobian.T @ left
-        scale = np.diag(square) + 1e-12 * max(1.0, np.trace(square))
-        while weight < 1e12:
-            step = np.clip(np.linalg.solve(square + weight * np.diag(scale), -slope), -1.0, 1.0)
-            tried = residual(np.clip(x + step, -18.0, 18.0))
-            if float(tried @ tried) < cost:
-                break
-            weight *= HARDER
-        else:
-            break
-        better = 1.0 - float(tried @ tried) / max(cost, 1e-300)
-        x, left, cost, weight = np.clip(x + step, -18.0, 18.0), tried, float(tried @ tried), weight * EASIER
-        if better < FINEST:
-            break
-    return cost / len(torque), drive(x)
+    x, bounds = np.log([getattr(start, name) for name in free]), np.full((2, len(free)), [[-18.0], [18.0]])
+    found, _ = least_squares(x, residual, list(bounds), eps=1e-4, x_scale="jac", verbose=0)
+    return float(np.sum(residual(found[:, None]) ** 2)), drive(found)

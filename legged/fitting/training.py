@@ -35,13 +35,31 @@ def train_network(
     try:
         torch.manual_seed(seed)  # for the initial weights
         if kind == "mlp":
-            layers = _train_mlp(log, inputs, torque, hidden, spacing * np.arange(samples), updates, random)
+            network, loss = _mlp(log, inputs, torque, hidden, spacing * np.arange(samples), random)
         else:
-            layers = _train_lstm(log, inputs, torque, hidden, updates, random)
+            network, loss = _lstm(log, inputs, torque, hidden, random)
+        optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE[kind])
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)  # decays to zero
+        for _ in range(updates):
+            optimiser.zero_grad()
+            loss().backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+            schedule.step()
     finally:
         torch.set_rng_state(state)
     dt, seen = (log.dt * spacing, samples) if kind == "mlp" else (log.dt, 1)
-    return NetworkWeights(kind, dt, seen, scales, layers)
+    layers = [_weights(layer) for layer in network.modules() if isinstance(layer, nn.Linear | nn.LSTM)]
+    return NetworkWeights(kind, dt, seen, scales, tuple(layers))
+
+
+def _weights(layer: nn.Module) -> dict[str, np.ndarray]:
+    """Return the weights of a layer by their names in `NetworkWeights`."""
+    weights = {name: values.detach().numpy().astype(np.float32) for name, values in layer.named_parameters()}
+    if isinstance(layer, nn.Linear):
+        return weights
+    bias = weights["bias_ih_l0"] + weights["bias_hh_l0"]
+    return {"input": weights["weight_ih_l0"], "hidden": weights["weight_hh_l0"], "bias": bias}
 
 
 def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
@@ -71,16 +89,15 @@ def _rows(log: ActuatorLog, past: int) -> np.ndarray:
     return rows
 
 
-def _train_mlp(
+def _mlp(
     log: ActuatorLog,
     seen: Sequence[np.ndarray],
     torque: np.ndarray,
     hidden: Sequence[int],
     lags: np.ndarray,
-    updates: int,
     random: torch.Generator,
-) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the layers of an MLP that sees errors and velocities `lags` samples ago; arrays are (T, D), scaled."""
+) -> tuple[nn.Module, Callable[[], Tensor]]:
+    """Return an MLP that sees errors and velocities `lags` samples ago, and its loss; arrays are (T, D), scaled."""
     rows = _rows(log, int(lags[-1]))
     inputs = torch.tensor(np.stack([values[rows - lag].ravel() for values in seen for lag in lags], 1), dtype=torch.float32)
     outputs = torch.tensor(torque[rows].ravel(), dtype=torch.float32)
@@ -92,19 +109,17 @@ def _train_mlp(
         picked = torch.randint(len(inputs), (min(BATCH, len(inputs)),), generator=random)
         return nn.functional.mse_loss(network(inputs[picked])[:, 0], outputs[picked])
 
-    _minimise(network, loss, updates, LEARNING_RATE["mlp"])
-    return tuple({"weight": _array(layer.weight), "bias": _array(layer.bias)} for layer in linear)
+    return network, loss
 
 
-def _train_lstm(
+def _lstm(
     log: ActuatorLog,
     seen: Sequence[np.ndarray],
     torque: np.ndarray,
     hidden: Sequence[int],
-    updates: int,
     random: torch.Generator,
-) -> tuple[dict[str, np.ndarray], ...]:
-    """Return the layers of an LSTM, by backpropagation through sequences; arrays are (T, D), scaled."""
+) -> tuple[nn.Module, Callable[[], Tensor]]:
+    """Return an LSTM, and its loss by backpropagation through sequences; arrays are (T, D), scaled."""
     ends = torch.tensor(_rows(log, CHUNK - 1))
     inputs = torch.tensor(np.stack(seen, axis=2), dtype=torch.float32)
     outputs = torch.tensor(torque, dtype=torch.float32)
@@ -120,27 +135,4 @@ def _train_lstm(
             x, _ = cell(x)
         return nn.functional.mse_loss(last(x)[BURN_IN:, :, 0], outputs[rows, joints][BURN_IN:])
 
-    _minimise(nn.ModuleList([*cells, last]), loss, updates, LEARNING_RATE["lstm"])
-    layers = []
-    for cell in cells:
-        weights = dict(cell.named_parameters())
-        bias = _array(weights["bias_ih_l0"] + weights["bias_hh_l0"])
-        layers.append({"input": _array(weights["weight_ih_l0"]), "hidden": _array(weights["weight_hh_l0"]), "bias": bias})
-    return (*layers, {"weight": _array(last.weight), "bias": _array(last.bias)})
-
-
-def _minimise(network: nn.Module, loss: Callable[[], Tensor], updates: int, rate: float) -> None:
-    """Make a number of Adam updates with a learning rate that decays to zero."""
-    optimiser = torch.optim.Adam(network.parameters(), rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    for _ in range(updates):
-        optimiser.zero_grad()
-        found = loss()
-        found.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().numpy().astype(np.float32)
+    return nn.ModuleList([*cells, last]), loss
