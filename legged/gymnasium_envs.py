@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any, ClassVar, Literal
 
 import gymnasium
@@ -20,9 +21,8 @@ from legged.errors import ConfigError, suggest
 from legged.registry import make_task, task_config
 from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
-Seen = Literal["actor", "dict"]
-"""Form of the observations: the policy's groups joined in one array, or a dictionary of all groups."""
 SEEN = ("actor", "dict")
+"""Forms of the observations: the policy's groups joined in one array, or a dictionary of all groups."""
 RENDER_MODES = ["rgb_array"]
 REWARD = "reward_"
 """Prefix of the reward terms in infos."""
@@ -31,23 +31,28 @@ LARGEST_PICTURE = 16384
 """Largest side of a picture [pixels]. It is a limit of graphics cards."""
 
 
-class _Driver:
-    """Shared part of both kinds of environment. It has a task that keeps the last step of every episode, the task's spaces
-    and camera, and its own random numbers, because tasks draw from torch's global generators.
+class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
+    """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
+    first observation of the next episode, and `infos["final_obs"]` has the last observation of the old episode. The
+    environments have their own random numbers, because tasks draw from torch's global generators.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
+        "render_modes": RENDER_MODES,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
 
     def __init__(
         self,
         task: str,
         num_envs: int,
         *,
+        to_numpy: bool = True,
         render_mode: str | None = None,
         device: str = "cpu",
         physics: str = "auto",
         config: Mapping[str, Any] | None = None,
-        observations: Seen = "actor",
+        observations: Literal["actor", "dict"] = "actor",
         width: int = 480,
         height: int = 270,
     ) -> None:
@@ -66,6 +71,7 @@ class _Driver:
             raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
         if "env.num_envs" in (config or {}):
             raise ConfigError("config: env.num_envs: the number of environments is that of make_vec(..., num_envs=...)")
+        self.num_envs, self._to_numpy = num_envs, to_numpy
         self.render_mode, self._size = render_mode, (int(width), int(height))
         self._device = pick_device(str(device), "device")
         settings = [("train.algorithm.num_mini_batches", 1), *(config or {}).items(), ("env.num_envs", num_envs)]
@@ -77,7 +83,7 @@ class _Driver:
             self.task: Any = make_task(cfg, self._device, graph=False)
             """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
             # On a GPU the captured step includes the copies of final states. On the CPU it need not be checked for capture.
-            self._final = keep_final_step(self.task, graph=self._device.type == "cuda")
+            self.final = keep_final_step(self.task, graph=self._device.type == "cuda")
             # One step is made and undone, because terms create buffers at their first call, which the initial state includes.
             before = self.task.state_dict()
             self.task.step(torch.zeros_like(self.task.actions))
@@ -95,9 +101,11 @@ class _Driver:
         clip = cfg.observations.clip
         widths = {name: group.buffer.shape[1] for name, group in self.task.observation_groups.items()}
         boxes: dict[str, spaces.Space[Any]] = {name: box(clip, width) for name, width in widths.items()}
-        self._actions = box(cfg.control.clip_actions, self.task.num_actions)
         chosen = self._groups
-        self._observations = spaces.Dict(boxes) if chosen is None else box(clip, sum(widths[name] for name in chosen))
+        self.single_observation_space = spaces.Dict(boxes) if chosen is None else box(clip, sum(widths[n] for n in chosen))
+        self.single_action_space = box(cfg.control.clip_actions, self.task.num_actions)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
 
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
@@ -113,15 +121,19 @@ class _Driver:
             finally:
                 self._random = [torch.get_rng_state(), *(torch.cuda.get_rng_state(device) for device in on_gpu)]
 
-    def _reset(self, seed: int | None, options: dict[str, Any] | None, chosen: np.random.Generator) -> Any:
-        """Start an episode in every environment and return the observations. A seed restores the initial state, curricula
-        included, and seeds the random numbers. Without a seed the random numbers continue. `chosen` draws the first seed.
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode in every environment; return the observations (N, width) and empty infos. A seed restores the
+        initial state, curricula included, and seeds the random numbers. Without a seed the random numbers continue.
+
+        Raises:
+            ConfigError: `options` are given.
         """
+        super().reset(seed=seed)
         if options:
             raise ConfigError(f"reset: options: the task has no options, got {shown(options)}")
         with self._own_random_numbers():
             if seed is not None or not self._seeded:
-                drawn = int(chosen.integers(LARGEST_SEED)) if seed is None else seed % LARGEST_SEED
+                drawn = int(self.np_random.integers(LARGEST_SEED)) if seed is None else seed % LARGEST_SEED
                 torch.random.default_generator.manual_seed(drawn)
                 if self._device.type == "cuda":
                     with torch.cuda.device(self._device):
@@ -129,132 +141,7 @@ class _Driver:
             if seed is not None:
                 self.task.load_state_dict(self._beginning)
             self._seeded = True
-            return self._seen(dict(self.task.reset().items()))
-
-    def _step(self, actions: Any) -> tuple[Any, Tensor]:
-        """Make a step with `actions` (N, D); return the observations and the rewards (N,) in new tensors."""
-        with self._own_random_numbers():
-            observations, rewards, _, _ = self.task.step(actions)
-        return self._seen(dict(observations.items())), rewards
-
-    def _final_observations(self) -> Any:
-        """Return the observations of the last step before environments were reset, in new tensors."""
-        return self._seen({name: seen.clone() for name, seen in self._final.observations.items()})
-
-    def _reward_parts(self, to_numpy: bool) -> dict[str, Any]:
-        """Return the terms of the last rewards, (N,) each, in new tensors or arrays."""
-        parts = self.task.rewards.last.clone()
-        rows = parts.cpu().numpy() if to_numpy else parts  # all in one copy
-        return {f"{REWARD}{name}": part for name, part in zip(self.task.rewards.names, rows, strict=True)}
-
-    def _seen(self, groups: dict[str, Tensor]) -> Any:
-        """Return the observations in the requested form."""
-        if self._groups is None:
-            return groups
-        chosen = [groups[name] for name in self._groups]
-        return chosen[0] if len(chosen) == 1 else torch.cat(chosen, dim=1)
-
-    def _pictures(self) -> list[np.ndarray] | None:
-        """Return a picture (height, width, 3) uint8 of the present state of every environment; None without a render mode."""
-        if self.render_mode is None:
-            gymnasium.logger.warn('render() shows nothing without a render mode: make(..., render_mode="rgb_array")')
-            return None
-        if self._camera is None:
-            self._camera = camera_of(self.task, 1, *self._size)
-        found = []
-        for env in range(self.task.num_envs):
-            self._camera.turn_to(env)
-            found.append(self._camera.picture())
-        return found
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Free the camera."""
-        if self._camera is not None:
-            self._camera.close()
-            self._camera = None
-
-
-class TaskEnv(_Driver, gymnasium.Env):  # type: ignore[misc]
-    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
-
-    def __init__(self, task: str, **arguments: Any) -> None:
-        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
-        super().__init__(task, 1, **arguments)
-        self.action_space, self.observation_space = self._actions, self._observations
-        self._over = True
-        self._shows_the_next = False
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; return the observation and empty infos.
-
-        Raises:
-            ConfigError: `options` are given.
-        """
-        super().reset(seed=seed)
-        seen = self._reset(seed, options, self.np_random)
-        self._over = self._shows_the_next = False
-        return row(as_numpy(seen), 0), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make a step with `action` (D,). Return the observation, the reward, True if the episode ended in a failure, True if
-        its time ran out, and infos with the reward terms, `reward_<name>`.
-
-        Raises:
-            ResetNeeded: no episode is running.
-            ValueError: the action has another shape, or is not of real numbers.
-        """
-        if self._over:
-            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() before step()")
-        seen, rewards = self._step(action[None] if isinstance(action, Tensor) else np.asarray(action)[None])
-        terminated, truncated = bool(self.task.terminated_buf[0]), bool(self.task.time_out_buf[0])
-        self._over = self._shows_the_next = terminated or truncated
-        if self._over:
-            seen = self._final_observations()
-        infos = {name: float(part[0]) for name, part in self._reward_parts(to_numpy=True).items()}
-        return row(as_numpy(seen), 0), float(rewards[0]), terminated, truncated, infos
-
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """Return a picture (height, width, 3) uint8, or None without a `render_mode`.
-
-        Raises:
-            RunError: this machine cannot render.
-        """
-        if self._shows_the_next and self.render_mode is not None:  # show the episode's end; only a reset can follow
-            self.task.physics.write(torch.ones_like(self.task.reset_buf), self._final.qpos, self._final.qvel)
-            self.task.sense()
-            self._shows_the_next = False
-        pictures = self._pictures()
-        return None if pictures is None else pictures[0]
-
-    def close(self) -> None:
-        """Free the camera."""
-        self.close_extras()
-
-
-class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
-    """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
-    first observation of the next episode, and `infos["final_obs"]` has the last observation of the old episode.
-    """
-
-    metadata: ClassVar[dict[str, Any]] = {**_Driver.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
-
-    def __init__(self, task: str, num_envs: int, *, to_numpy: bool = True, **arguments: Any) -> None:
-        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `_Driver`."""
-        super().__init__(task, num_envs, **arguments)
-        self.num_envs, self._to_numpy = num_envs, to_numpy
-        self.single_action_space, self.single_observation_space = self._actions, self._observations
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in every environment; return the observations (N, width) and empty infos.
-
-        Raises:
-            ConfigError: `options` are given.
-        """
-        super().reset(seed=seed)
-        seen = self._reset(seed, options, self.np_random)  # type: ignore[arg-type]
-        return (as_numpy(seen) if self._to_numpy else seen), {}
+            return self._seen(self.task.reset()), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Make a step with `actions` (N, D). Return the observations (N, width), the rewards (N,), masks (N,) of the episodes
@@ -268,17 +155,30 @@ class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
         Raises:
             ValueError: the actions have another shape, or are not real numbers.
         """
-        found: tuple[Any, ...] = *self._step(actions), self.task.terminated_buf.clone(), self.task.time_out_buf.clone()
-        if self._to_numpy:
-            found = tuple(as_numpy(value) for value in found)
-        seen, rewards, terminated, truncated = found
-        ended, parts = terminated | truncated, self._reward_parts(self._to_numpy)
+        with self._own_random_numbers():
+            observations, rewards, _, _ = self.task.step(actions)
+        seen, rewards = self._seen(observations), self._given(rewards)
+        terminated, truncated = (self._given(mask.clone()) for mask in (self.task.terminated_buf, self.task.time_out_buf))
+        ended = terminated | truncated
+        terms = self._given(self.task.rewards.last.clone())  # all in one copy
+        parts = {f"{REWARD}{name}": part for name, part in zip(self.task.rewards.names, terms, strict=True)}
         infos = masked(parts, ~ended)
         if not self._to_numpy or ended.any():
-            last = self._final_observations()
-            final_obs = rows_of(as_numpy(last), ended) if self._to_numpy else last
+            last = self._seen({name: group.clone() for name, group in self.final.observations.items()})
+            final_obs = rows_of(last, ended) if self._to_numpy else last
             infos |= masked({"final_obs": final_obs, "final_info": masked(parts, ended)}, ended)
         return seen, rewards, terminated, truncated, infos
+
+    def _seen(self, groups: Mapping[str, Tensor]) -> Any:
+        """Return the observations in the requested form."""
+        if self._groups is None:
+            return {name: self._given(group) for name, group in groups.items()}
+        chosen = [groups[name] for name in self._groups]
+        return self._given(chosen[0] if len(chosen) == 1 else torch.cat(chosen, dim=1))
+
+    def _given(self, value: Tensor) -> Any:
+        """Return a tensor as it is or as an array. The array of a tensor on the CPU shares the tensor's memory."""
+        return value.cpu().numpy() if self._to_numpy else value
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
         """Return a picture (height, width, 3) uint8 of each environment, or None without a `render_mode`.
@@ -286,17 +186,83 @@ class TaskVectorEnv(_Driver, VectorEnv):  # type: ignore[misc]
         Raises:
             RunError: this machine cannot render.
         """
-        pictures = self._pictures()
-        return None if pictures is None else tuple(pictures)
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() shows nothing without a render mode: make(..., render_mode="rgb_array")')
+            return None
+        if self._camera is None:
+            self._camera = camera_of(self.task, 1, *self._size)
+        found = []
+        for env in range(self.task.num_envs):
+            self._camera.turn_to(env)
+            found.append(self._camera.picture())
+        return tuple(found)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Free the camera."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
 
-def as_numpy(value: Any) -> Any:
-    """Return a tensor, or the tensors of a dictionary, as arrays. The array of a tensor on the CPU shares the tensor's
-    memory.
-    """
-    if isinstance(value, dict):
-        return {name: as_numpy(part) for name, part in value.items()}
-    return value.cpu().numpy() if isinstance(value, Tensor) else value
+class TaskEnv(gymnasium.Env):  # type: ignore[misc]
+    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
+
+    def __init__(self, task: str, **arguments: Any) -> None:
+        """Build the task `task`; the arguments are explained in docs/gymnasium.md. Raises the errors of `TaskVectorEnv`."""
+        self._vector = vector = TaskVectorEnv(task, 1, to_numpy=True, **arguments)
+        self.task, self.render_mode = vector.task, vector.render_mode
+        self.metadata = {**type(self).metadata, "render_fps": vector.metadata["render_fps"]}  # type: ignore[misc]
+        self.action_space, self.observation_space = vector.single_action_space, vector.single_observation_space
+        self._over = True
+        self._shows_the_next = False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; return the observation and empty infos.
+
+        Raises:
+            ConfigError: `options` are given.
+        """
+        super().reset(seed=seed)
+        self._vector.np_random = self.np_random  # for the first seed
+        seen, infos = self._vector.reset(seed=seed, options=options)
+        self._over = self._shows_the_next = False
+        return row(seen, 0), infos
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Make a step with `action` (D,). Return the observation, the reward, True if the episode ended in a failure, True if
+        its time ran out, and infos with the reward terms, `reward_<name>`.
+
+        Raises:
+            ResetNeeded: no episode is running.
+            ValueError: the action has another shape, or is not of real numbers.
+        """
+        if self._over:
+            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() before step()")
+        actions = action[None] if isinstance(action, Tensor) else np.asarray(action)[None]
+        seen, (reward,), (terminated,), (truncated,), infos = self._vector.step(actions)
+        self._over = self._shows_the_next = bool(terminated or truncated)
+        observation = infos["final_obs"][0] if self._over else row(seen, 0)
+        terms = {name: float(part[0]) for name, part in infos.items() if name.startswith(REWARD)}
+        return observation, float(reward), bool(terminated), bool(truncated), terms
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """Return a picture (height, width, 3) uint8, or None without a `render_mode`.
+
+        Raises:
+            RunError: this machine cannot render.
+        """
+        if self._shows_the_next and self.render_mode is not None:  # show the episode's end; only a reset can follow
+            self.task.physics.write(torch.ones_like(self.task.reset_buf), self._vector.final.qpos, self._vector.final.qvel)
+            self.task.sense()
+            self._shows_the_next = False
+        pictures = self._vector.render()
+        return None if pictures is None else pictures[0]
+
+    def close(self) -> None:
+        """Free the camera."""
+        self._vector.close_extras()
 
 
 def row(value: Any, index: int) -> Any:
@@ -308,8 +274,7 @@ def rows_of(value: Any, mask: np.ndarray) -> np.ndarray:
     """Return an array (N,) of objects, as Gymnasium stores final observations: copies of the rows in `mask` (N,) or None."""
     found = np.full(len(mask), None, dtype=object)
     for index in mask.nonzero()[0].tolist():
-        one = row(value, index)
-        found[index] = {name: part.copy() for name, part in one.items()} if isinstance(one, dict) else one.copy()
+        found[index] = deepcopy(row(value, index))
     return found
 
 
