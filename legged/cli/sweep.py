@@ -30,7 +30,7 @@ from legged.process.paths import make_folder, ready_to_write, relative, write_te
 from legged.process.processes import Job, Kind, WorkerPool, why_failed
 from legged.process.ranks import Ranks
 from legged.sweeping.plan import Plan, plan_sweep, sweep_file
-from legged.sweeping.trials import RUNS, WHY, Trials, finished, repeating, write_report
+from legged.sweeping.trials import RUNS, WHY, Trials, repeating, write_report
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     again = trials.take_back()
     if trials.all:
         numbers = f"; tried again: {', '.join(map(str, again))}" if again else ""
-        done = f"{trials.done} of {plan.given.trials} trials are done"
+        done = f"{len(trials.finished)} of {plan.given.trials} trials are done"
         print(f"going on in {relative(plan.folder)}: {done}{numbers}", flush=True)
     if jobs == 1:
         stopped_by = Worker(plan, trials, alone).run()
@@ -121,21 +121,21 @@ def run(args: argparse.Namespace) -> int:
     print(*write_report(trials, args.module), sep="\n")
     if stopped_by:
         return 128 + stopped_by[0]
-    return 0 if trials.done >= plan.given.trials else EXIT_FAILED
+    return 0 if len(trials.finished) >= plan.given.trials else EXIT_FAILED
 
 
 def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -> list[int]:
     """Run trials in several processes; return the signals that ended processes early."""
     given, start, starts = trials.plan.given, time.perf_counter(), [0] * jobs
     pool = WorkerPool({Kind.TRAINING: jobs})
-    told = {trial.number for trial in finished(trials.all)}
+    told = {trial.number for trial in trials.finished}
 
     def say(text: str) -> None:
         print(f"{time.perf_counter() - start:7.1f} s  {text}", flush=True)
 
     def tell() -> None:
         """Print the trials of other processes that have ended since the last call."""
-        for trial in finished(trials.all):
+        for trial in trials.finished:
             if trial.number not in told:
                 told.add(trial.number)
                 what = trial.user_attrs.get(WHY) if trial.value is None else f"{trial.value:.4g}"
@@ -201,7 +201,7 @@ class Worker:
 
         def say(text: str) -> None:
             now = time.perf_counter()
-            counted = f"[{self.trials.done} of {self.plan.given.trials}]"
+            counted = f"[{len(self.trials.finished)} of {self.plan.given.trials}]"
             print(f"{now - self._start:7.1f} s  trial {trial.number:3d} ({now - begun:.1f} s)  {text}  {counted}", flush=True)
 
         try:

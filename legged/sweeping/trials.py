@@ -103,9 +103,9 @@ class Trials:
         return self.study.get_trials(deepcopy=False)
 
     @property
-    def done(self) -> int:
-        """Return the number of trials that ended with a value or were ended early."""
-        return len(finished(self.all))
+    def finished(self) -> list["FrozenTrial"]:
+        """Return the trials that ended with a value or were ended early."""
+        return [trial for trial in self.all if trial.state.name in ("COMPLETE", "PRUNED")]
 
     def next(self) -> "Trial | None":
         """Begin the next trial, a repeated or a new one. Return None if there are enough trials. Processes that call this at
@@ -113,7 +113,7 @@ class Trials:
         """
         self.take_back()
         wanted = self.plan.given.trials
-        if len(finished(self.all)) + len(self._running()) >= wanted:
+        if len(self.finished) + len(self._running()) >= wanted:
             return None
         # The seed depends on the number of trials, so that a process that resumes a sweep draws new values.
         begun = len(self.all)
@@ -126,7 +126,7 @@ class Trials:
         trial.set_user_attr(ALIVE, time.time())
         trial.set_user_attr(OWNER, me())
         earlier = [other for other in self._running() if other.number < trial.number]
-        if len(finished(self.all)) + len(earlier) >= wanted:
+        if len(self.finished) + len(earlier) >= wanted:
             self.end(trial, "FAIL", "there were enough")
             return None
         return trial
@@ -176,11 +176,6 @@ class Trials:
                 self._storage.set_trial_user_attr(trial._trial_id, ALIVE, time.time())
 
         return repeating(beat, BEAT_S)
-
-
-def finished(trials: list["FrozenTrial"]) -> list["FrozenTrial"]:
-    """Return the trials that ended with a value or were ended early."""
-    return [trial for trial in trials if trial.state.name in ("COMPLETE", "PRUNED")]
 
 
 def _open(asked: str, folder: Path) -> "BaseStorage":
@@ -296,7 +291,7 @@ def write_report(trials: Trials, module: str | None = None) -> list[str]:
     ranked, folder = ranking(plan, all_trials), plan.folder
     write_text(folder / "table.md", table(plan, all_trials, module))
     written = [folder / "table.md"]
-    lines = [f"{trials.done} of {plan.given.trials} trials are done"]
+    lines = [f"{len(trials.finished)} of {plan.given.trials} trials are done"]
     if ranked:
         best, own = ranked[0], own_trial(plan, ranked)
         write_text(folder / "best.yaml", best_yaml(plan, best))

@@ -187,7 +187,7 @@ def test_no_more_trials_are_begun_than_are_wanted_whoever_asks():
     first.study.tell(1, 1.0)
     assert first.next() is None
     assert states(second) == ["RUNNING", "COMPLETE", "RUNNING"]
-    assert second.done == 1
+    assert len(second.finished) == 1
 
 
 @pytest.mark.slow
@@ -202,7 +202,7 @@ def test_a_trial_of_a_dead_process_is_tried_again_once_with_its_settings():
     assert states(trials) == ["FAIL", "WAITING"]
     again = trials.next()
     assert (again.number, trials.plan.settings(again.params)) == (1, drawn)
-    assert trials.done == 0
+    assert trials.finished == []
     for tries in range(2, study.MOST_TRIES + 1):
         assert again.user_attrs[study.TRIES] == tries
         again.set_user_attr(study.OWNER, me() + "0")
