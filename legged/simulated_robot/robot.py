@@ -77,7 +77,6 @@ class Motors:
         self._extra = breakaway - self._coulomb
         self._stribeck, self._smoothing = cfg.stribeck_velocity, cfg.friction_smoothing
         self._has_curve = cfg.model == "dc_motor"
-        self._has_friction = bool(self._coulomb.any() or self._extra.any() or self._viscous.any())
         self._random, self._range, self._ratio = np.random.default_rng(seed), cfg.delay, counted / dt
         self._varies = cfg.delay_varies
         self.delay = self._draw()
@@ -106,7 +105,9 @@ class Motors:
             share = dq / self._fastest
             torques = np.minimum(np.maximum(torques, self._stall * (-1.0 - share)), self._stall * (1.0 - share))
         torques = np.clip(torques, -self._effort, self._effort)
-        return np.clip(torques - self._friction(dq), -self._effort, self._effort) if self._has_friction else torques
+        slow = np.exp(-np.square(dq / self._stribeck))
+        friction = (self._coulomb + self._extra * slow) * np.tanh(dq / self._smoothing) + self._viscous * dq
+        return np.clip(torques - friction, -self._effort, self._effort)
 
     def _arrived(self, command: np.ndarray) -> np.ndarray:
         """Return the newest command that has arrived; commands never overtake each other."""
@@ -116,11 +117,6 @@ class Motors:
         while len(self._past) > self.delay + 1:
             self._past.popleft()
         return self._past[0]
-
-    def _friction(self, dq: np.ndarray) -> np.ndarray:
-        """Return the friction torques (D,) [N m]."""
-        slow = np.exp(-np.square(dq / self._stribeck))
-        return (self._coulomb + self._extra * slow) * np.tanh(dq / self._smoothing) + self._viscous * dq
 
     def _learned(self, error: np.ndarray, dq: np.ndarray) -> np.ndarray:
         """Return the torques (D,) of the network [N m]."""

@@ -115,8 +115,12 @@ class Server:
                 break
             kind, sequence, body = udp.open_packet(data) or (None, 0, b"")
             if kind == udp.HELLO:
-                with suppress(ValueError, KeyError, TypeError, AttributeError):  # packets of unknown senders
-                    self._greet(client, udp.unpack_sources(body))
+                with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):  # packets of unknown senders
+                    self._sources = udp.unpack_sources(body)
+                    if client != self._client:
+                        self._newest = 0
+                    self._client = client  # from now on, it receives the states
+                    self._socket.sendto(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)), client)
             elif client == self._client and kind == udp.BYE:  # never delayed or lost, so that the simulation always ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
@@ -127,13 +131,6 @@ class Server:
                 if sequence > self._newest and asked.shape == self.robot.asked.shape:  # no newer one came before
                     self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
-    def _greet(self, client: tuple[str, int], sources: dict[str, np.ndarray | None]) -> None:
-        """Answer a handshake. From now on, its sender receives the states."""
-        if client != self._client:
-            self._newest = 0
-        self._client, self._sources = client, sources
-        self._send(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)))
-
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
         """Queue a state for sending."""
         self._sequence += 1
@@ -142,9 +139,6 @@ class Server:
     def _deliver(self, now: float) -> None:
         """Send the packets whose latency has passed."""
         for data in self._out.take(now):
-            self._send(data)
-
-    def _send(self, data: bytes) -> None:
-        if self._client is not None:
-            with suppress(OSError):  # the receiver has closed
-                self._socket.sendto(data, self._client)
+            if self._client is not None:
+                with suppress(OSError):  # the receiver has closed
+                    self._socket.sendto(data, self._client)
