@@ -82,7 +82,12 @@ def read_fork(path: Path, asked: str | None) -> Fork:
         place = _place(*data["place"]) if data["place"][0] else relative(path)
         raise ConfigError(f"{place}: the file does not run: {data['error']}{data['said']}")
     if "settings" not in data:
-        raise _no_choice(path, asked, data["classes"], data["tasks"])
+        which = suggest(asked or "", [*data["classes"], *data["tasks"]], "--task")
+        if data["classes"]:
+            given = "" if asked is None else f"{shown(asked)} names none of the classes: "
+            raise ConfigError(f"--task: {relative(path)} has several configurations, {given}say which{which}")
+        tasks = f"; it registers tasks: --task{suggest(asked or '', data['tasks'], 'tasks')}" if data["tasks"] else ""
+        raise ConfigError(f"{relative(path)}: has no configuration of an environment (class XCfg(LeggedRobotCfg)){tasks}")
     settings = {path: Found(value, _place(*where), why) for path, (value, *where, why) in data["settings"].items()}
     for section, values in ORIGINAL["rsl_rl"].items():
         named = [found.place for name, found in settings.items() if name.startswith(f"{section}.")]
@@ -126,13 +131,3 @@ def run_child(path: Path, asked: str | None) -> dict[str, Any]:
         return json.loads(done.stdout) | {"said": said}
     except ValueError:
         raise ConfigError(f"{relative(path)}: Python ended with code {done.returncode} while the file ran{said}") from None
-
-
-def _no_choice(path: Path, asked: str | None, classes: list[str], tasks: list[str]) -> ConfigError:
-    """Return the error of a file with no configuration, or with several."""
-    if not classes:
-        of_tasks = f"; it registers tasks: --task{suggest(asked or '', tasks, 'tasks')}" if tasks else ""
-        return ConfigError(f"{relative(path)}: has no configuration of an environment (class XCfg(LeggedRobotCfg)){of_tasks}")
-    given = "" if asked is None else f"{shown(asked)} names none of the classes: "
-    which = suggest(asked or "", [*classes, *tasks], "--task")
-    return ConfigError(f"--task: {relative(path)} has several configurations, {given}say which{which}")

@@ -5,6 +5,8 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from legged.config.loader import merge, nest
+from legged.config.origins import Origins
 from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import dump
 
@@ -18,11 +20,7 @@ def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mappin
     """Return the file of a task: a head, comments on settings, the settings, and the lost ones as comments."""
     sections: dict[str, Any] = {}
     for path in sorted(settings, key=lambda path: ORDER.index(path.partition(".")[0])):
-        *outer, name = path.split(".")
-        inner = sections
-        for key in outer:
-            inner = inner.setdefault(key, {})
-        inner[name] = settings[path]
+        merge(sections, nest(path, settings[path]), "", Origins())
     notes = [f"{path}: {text}" for path, text in comments.items() if path in settings]
     text = _comments([*head, *notes]) + "\n".join(_text(key, value) for key, value in sections.items())
     lost = [f"- {entry}" for entry in lost]
