@@ -40,7 +40,17 @@ class Neighbours:
 
     def __enter__(self) -> "Neighbours":
         with contextlib.suppress(OSError):  # in a folder that can't be written, others do not see this training
-            self._join()
+            for folder in (self._folder.parent, self._folder):
+                with contextlib.suppress(FileExistsError):
+                    folder.mkdir()
+                    folder.chmod(0o1777)  # writable for every user, like its parent folder
+            if not (self._folder / TURN).exists():
+                (self._folder / TURN).touch(0o644)
+            descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
+            self._lock = os.fdopen(descriptor, "wb")
+            os.chmod(name, 0o644)
+            lock_descriptor(descriptor, blocking=False)
+            self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
         self.look()
         return self
 
@@ -49,19 +59,6 @@ class Neighbours:
             with contextlib.suppress(OSError):
                 self._path.unlink()
             self._lock.close()
-
-    def _join(self) -> None:
-        for folder in (self._folder.parent, self._folder):
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir()
-                folder.chmod(0o1777)  # writable for every user, like its parent folder
-        if not (self._folder / TURN).exists():
-            (self._folder / TURN).touch(0o644)
-        descriptor, name = tempfile.mkstemp(prefix=f"{os.getpid()}.", dir=self._folder)
-        self._lock = os.fdopen(descriptor, "wb")
-        os.chmod(name, 0o644)
-        lock_descriptor(descriptor, blocking=False)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
 
     def glance(self) -> None:
         """Count the others, unless the last count was a moment ago."""

@@ -1,6 +1,7 @@
 """Pictures of terrain: tiles with a robot for scale, and a map of the heights."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -60,8 +61,7 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
     reach = FILLED * float(np.tan(0.5 * np.radians(FIELD_OF_VIEW)))
     _, _, (across, up) = frame(outline, (reach, reach), AZIMUTH, ELEVATION)
     height = int(WIDTH * np.clip(up / across, 0.3, 0.8))
-    camera = Camera(_model(terrain, robot, count, height), WIDTH, height)
-    try:
+    with closing(Camera(_model(terrain, robot, count, height), WIDTH, height)) as camera:
         camera.view.azimuth, camera.view.elevation = AZIMUTH, ELEVATION
         shape = (reach * WIDTH / height, reach)
         camera.view.lookat[:], camera.view.distance, _ = frame(outline, shape, AZIMUTH, ELEVATION)
@@ -69,8 +69,6 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
         camera.update()
         at = camera.pixels(np.array([_label_at(terrain, *place) for place in places]))
         return labels(camera.render(), texts, at)
-    finally:
-        camera.close()
 
 
 def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.MjModel:
