@@ -7,7 +7,7 @@ from rich.table import Table
 
 
 def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], left: Collection[int] = (0,)) -> str:
-    """Return a table in Markdown, which ends without a line break; columns in `left` hold texts, the others numbers."""
+    """Return a Markdown table without a line break at its end. Columns in `left` hold texts, all others hold numbers."""
     marks = ["---" if i in left else "---:" for i in range(len(heads))]
     lines = [[" ".join(str(cell).replace("|", "\\|").split()) for cell in line] for line in (heads, *rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in (lines[0], marks, *lines[1:]))
@@ -16,8 +16,8 @@ def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], le
 def screen_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
 ) -> Table:
-    """Return a table for the screen; columns in `left` hold texts, the others numbers. None in place of a row draws a
-    rule; a short row leaves its last cells empty.
+    """Return a table for the screen. Columns in `left` hold texts, all others hold numbers. A row that is None draws a rule;
+    a short row leaves its last cells empty.
     """
     table = Table(title=escape(title), title_justify="left")
     for i, head in enumerate(heads):

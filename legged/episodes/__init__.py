@@ -1,1 +1,1 @@
-"""Single episodes: recorded, sorted by what went wrong, shown as pages, with statistics of their joints."""
+"""Recordings of single episodes: they are sorted by what went wrong and shown as pages and as statistics of joints."""

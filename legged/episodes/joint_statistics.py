@@ -1,4 +1,4 @@
-"""Statistics of joints over time and over the gait cycle, of one policy or of two: tables, a page and a figure."""
+"""Statistics of joints over time and over the gait cycle, for one policy or two: tables, a page and a figure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,46 +15,46 @@ from legged.figures import COLORS, STYLES, figure
 from legged.process.paths import relative
 
 NAME = "joint_statistics"
-"""Name of the files, before their endings."""
+"""Name of the written files without their endings."""
 PANEL_INCHES = 3.6, 1.45
-"""Width and height of a panel of the figure."""
+"""Width and height of a panel of the figure [inches]."""
 SETTLE_S = 1.0
-"""Time at the start of an episode that is not counted, while a robot drops onto its feet [s]."""
+"""Time at the start of an episode that is left out, because the robot drops onto its feet then [s]."""
 PHASES = 50
-"""Points of a gait cycle."""
+"""Number of points over the phase of a gait cycle."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 0.1, 2.0
-"""Limits of a gait cycle: touch-downs closer together are bounces, those further apart have a stop between them [s]."""
+"""Limits of a gait cycle's length [s]. A shorter one is a bounce of the foot, and a longer one contains a stop."""
 UNUSUAL = 0.5
-"""Cycles whose length differs from the median by more than this share are left out: stops and stumbles."""
+"""Largest relative deviation of a cycle's length from the median. Other cycles, stops and stumbles, are left out."""
 MEASURED = (("joint_pos", "angle"), ("joint_vel", "velocity"), ("torque", "torque"))
-"""Arrays with statistics, and their titles."""
+"""Names and titles of the recorded arrays whose statistics are computed."""
 
 
 @dataclass(frozen=True)
 class JointStatistics:
-    """Statistics of D joints, over the steps after `SETTLE_S` of some episodes."""
+    """Statistics of D joints over those steps of some episodes that come after `SETTLE_S`."""
 
     joints: list[str]
     units: dict[str, list[str]]
     mean: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
-    """Array -> (D,) units, means and standard deviations over the steps of all episodes."""
+    """Units, means and standard deviations over the steps of all episodes, each as array -> (D,)."""
     episodes: int
     """Number of episodes longer than `SETTLE_S`."""
     steps: int
     lost: int
-    """Number of steps left out because their numbers are not finite."""
+    """Number of steps that are left out because they hold numbers that are not finite."""
     cycles: dict[str, np.ndarray]
-    """Array -> (C, PHASES, D) values over the phase of each cycle, from one touch-down on to the next."""
+    """Array -> (C, PHASES, D) values over the phase of each of C cycles, from one touch-down to the next."""
     cycle_s: np.ndarray
     """(C,) length of each cycle [s]."""
     duty: dict[str, float]
-    """Foot, first the one whose touch-downs delimit cycles -> share of the cycles' steps at whose end it has contact, as the
-    duty factor of an evaluation; `feet_contact` holds each contact a step longer.
+    """Foot -> share of the cycles' steps at whose end the foot has contact, like the duty factor of an evaluation. The first
+    foot is the one whose touch-downs delimit cycles. In `feet_contact`, each contact lasts a step longer.
     """
 
     def over_cycle(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation over cycles, (PHASES, D) each."""
+        """Return mean and standard deviation of an array over the cycles, (PHASES, D) each."""
         return self.cycles[name].mean(axis=0), self.cycles[name].std(axis=0)
 
 
@@ -88,7 +88,7 @@ def joint_statistics(episodes: Episodes) -> JointStatistics:
     values = {name: np.concatenate([part[name] for part in parts]).astype(np.float64) for name in names}
     steps = len(values[names[0]])
     if not steps:
-        raise ConfigError(f"POLICY: physics blew up: no step of '{task}' after {SETTLE_S:g} s has numbers")
+        raise ConfigError(f"POLICY: physics blew up: no step of '{task}' after {SETTLE_S:g} s has finite numbers")
     usual = float(np.median([end - begin for begin, end, _ in spans])) if spans else 0.0
     spans = [(begin, end, one) for begin, end, one in spans if abs(end - begin - usual) <= UNUSUAL * usual]
     contacts = [one["feet_force"][begin:end, :, 2] > episodes.about["contact_threshold"] for begin, end, one in spans]
@@ -107,7 +107,7 @@ def joint_statistics(episodes: Episodes) -> JointStatistics:
 
 
 def cycles_of(contact: np.ndarray, dt: float) -> list[tuple[int, int]]:
-    """Return the first step of every cycle and that of the next, from the contacts (T,) of a foot."""
+    """Return (first step, first step of the next cycle) for every gait cycle, from the contacts (T,) of a foot."""
     down = contact > 0.5
     touched = np.flatnonzero(down[1:] & ~down[:-1]) + 1
     pairs = [(int(begin), int(end)) for begin, end in pairwise(touched)]
@@ -115,7 +115,7 @@ def cycles_of(contact: np.ndarray, dt: float) -> list[tuple[int, int]]:
 
 
 def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
-    """Return (PHASES, D) values, interpolated from the rows `begin` to `end` (exclusive) of values (T, D)."""
+    """Return the rows `begin` to `end` (exclusive) of values (T, D), interpolated linearly to (PHASES, D)."""
     at = begin + (end - begin) * np.arange(PHASES) / PHASES
     below = np.floor(at).astype(int)
     share = (at - below)[:, None]
@@ -126,7 +126,7 @@ def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
 
 
 def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None:
-    """Write the statistics of policies, by their labels, into `folder`, as Markdown, HTML and PNG.
+    """Write statistics, label of a policy -> statistics, into `folder` as Markdown, HTML and PNG.
 
     Raises:
         RunError: a file can't be written.
@@ -143,17 +143,17 @@ def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None
 
 
 def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
-    """Return title -> table, one table for each quantity, with one line for each joint: mean and standard deviation of each
-    policy, and for two policies the difference of their means. The last table is on gait cycles, if there are any.
+    """Return title -> table, one table for each quantity with one line for each joint: mean and standard deviation of each
+    policy and, for two policies, the difference of the means. If there are gait cycles, the last table describes them.
 
     Raises:
-        ConfigError: two policies have other joints.
+        ConfigError: the joints of two policies differ.
     """
     several, tables = list(found.values()), {}
     one, other = several[0].joints, several[-1].joints
     if one != other:
         differing = ", ".join([name for name in (*one, *other) if (name in one) != (name in other)][:4]) or "in another order"
-        raise ConfigError(f"POLICY: the two have other joints ({differing}); name policies of the same robot")
+        raise ConfigError(f"POLICY: the joints of the two policies differ ({differing}); name policies of the same robot")
     names = [f", {label}" if len(found) > 1 else "" for label in found]
     for name, title in _measured(found):
         heads = ["joint", *(f"{what}{of}" for of in names for what in ("mean", "standard deviation"))]
@@ -189,7 +189,7 @@ def _number(value: Any, form: str = ".3f") -> Number:
 
 
 def notes_of(found: Mapping[str, JointStatistics]) -> str:
-    """Return sentences on the episodes and steps behind the statistics."""
+    """Return sentences that say from which episodes and steps the statistics are computed."""
     parts = []
     for label, one in found.items():
         lost = f"; {one.lost} more are left out because physics blew up in them" if one.lost else ""
@@ -202,8 +202,8 @@ def notes_of(found: Mapping[str, JointStatistics]) -> str:
 
 
 def draw_statistics(found: Mapping[str, JointStatistics], path: Path) -> None:
-    """Draw every joint over the gait cycle, as mean and a band of one standard deviation; without cycles, mean and standard
-    deviation of all joints side by side. Each policy has its own colour and line style.
+    """Draw the mean of every joint over the gait cycle, with a band of one standard deviation. Without cycles, draw the
+    means and standard deviations of all joints side by side. Each policy has its own colour and line style.
     """
     cyclic = all(len(one.cycle_s) for one in found.values())
     names, first = _measured(found), next(iter(found.values()))

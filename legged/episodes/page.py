@@ -1,6 +1,6 @@
-"""The page of an episode: one HTML file that holds its film, plots, numbers and the script that draws them. For the film the
-recorded states are written into a task with one robot and drawn like those of play; without a renderer, the bodies' positions
-are drawn as a stick figure.
+"""The page of an episode: one HTML file that holds its film, plots, numbers and the script that draws them. For the film,
+recorded states are written into a task with one robot and drawn as in `play`. If nothing can be rendered, the page draws the
+positions of the bodies as a stick figure.
 """
 
 import base64
@@ -31,24 +31,25 @@ from legged.rendering.camera import RobotsCamera, camera_of
 WIDTH, HEIGHT = 640, 360
 """Size of a picture [pixels]."""
 FPS, MOST_PICTURES = 25.0, 400
-"""Pictures per second, and the largest number of pictures of an episode; longer episodes have fewer per second."""
+"""Pictures per second, and the largest number of pictures of an episode. Long episodes have fewer pictures per second."""
 FILL, GLIDE = 0.5, 0.3
-"""Share of the picture that a robot fills, and share of the distance to it that the camera moves in a picture."""
+"""Share of the picture's size that the robot fills, and share of the distance to the robot by which the camera moves in each
+picture."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)
-"""Qualities of JPEG; the first whose pictures together fit into BUDGET_MB is taken."""
+"""JPEG qualities. The first one with which all pictures of an episode fit into BUDGET_MB is taken."""
 BUDGET_MB = 3.0
-"""Room for the pictures of a page [MB]; base64 adds a third."""
+"""Largest size of all pictures of a page, to which base64 adds a third [MB]."""
 OTHERS = "#BBBBBB"
 MOST_PARTS = 7
-"""Reward parts with their own colour, the largest ones; the rest is summed."""
+"""Number of the largest reward parts, which have their own colours; the other parts are summed."""
 MOST_LINES = 8
-"""Most lines of a plot."""
+"""Largest number of lines of a plot."""
 LEG = re.compile(r"(?i)[lr]|[lr][fh]|[bfhmr][lr]|left|right|front|rear|hind|back")
-"""Words in a joint's name for its leg."""
+"""Pattern of the words in a joint's name that stand for its leg."""
 
 
 def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, film: dict[str, Any]) -> None:
-    """Write the page of an episode into `folder`, episode_NUMBER.html. `film` is the result of `Projector.show`.
+    """Write the page of an episode, episode_<number>.html, into `folder`. `film` is the result of `Projector.show`.
 
     Raises:
         RunError: the page can't be written.
@@ -70,7 +71,7 @@ def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, 
     sums = np.nan_to_num(episodes.of(number)["reward_parts"]).sum(axis=0, dtype=np.float64)
     names, series = episodes.columns("reward_parts"), {}
     returns = [(f"return of {names[i]}", f"{sums[i]:.2f}") for i in np.argsort(-np.abs(sums), kind="stable")]
-    for name, array in panels.arrays.items():  # (T,) or (T, K), as little-endian 32-bit floats in base64, row by row
+    for name, array in panels.arrays.items():  # (T,) or (T, K) is written as little-endian 32-bit floats in base64
         rows = array.reshape(len(array), -1)
         values = base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii")
         series[name] = {"values": values, "columns": rows.shape[1]}
@@ -99,7 +100,7 @@ class Projector:
     """Renderer of recorded episodes. The task of the episodes is built once, with one robot in the C engine."""
 
     def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
-        """Build the task that `cfg` describes, on the ground of the episodes.
+        """Build the task of the configuration `cfg` on the ground of the episodes.
 
         Raises:
             ConfigError: the task no longer exists, or its model has changed.
@@ -115,11 +116,11 @@ class Projector:
         model = self.task.physics.model
         for name, width in (("qpos", model.nq), ("qvel", model.nv)):
             if episodes[name].shape[1] != width:
-                raise ConfigError(f"{cfg.task}: its model has changed: {name} has {width} numbers, not as in the episodes")
+                raise ConfigError(f"{cfg.task}: its model has changed: {name} has {width} numbers, unlike the episodes")
 
     def show(self, number: int) -> dict[str, Any]:
-        """Return the film of an episode for its page: `every` steps a picture, and `pictures` as JPEG in base64. Without a
-        renderer, return the reason `why`, the `parents` of B bodies, and their `places` (T', B, 3) [m], world frame.
+        """Return the film of an episode for its page: `pictures` as JPEG in base64, one after `every` steps. If nothing can
+        be rendered, return the reason `why`, the `parents` of B bodies, and their `places` (T', B, 3), world frame [m].
         """
         steps = int(self.episodes.lengths[number])
         every = max(1, round(1.0 / (FPS * self.episodes.dt)), -(-steps // MOST_PICTURES))
@@ -146,7 +147,7 @@ class Projector:
         return [base64.b64encode(picture).decode("ascii") for picture in found]
 
     def _put(self, one: dict[str, np.ndarray], step: int) -> None:
-        """Put the robot into a recorded state, with its command."""
+        """Put the robot into the state after a recorded step, and set the recorded command."""
         task = self.task
         qpos, qvel = (torch.as_tensor(np.nan_to_num(one[name][step : step + 1])) for name in ("qpos", "qvel"))
         task.physics.write(torch.ones(1, dtype=torch.bool), qpos, qvel)
@@ -157,7 +158,7 @@ class Projector:
     def _stick_figure(self, number: int, shown: list[int]) -> dict[str, Any]:
         model = self.task.physics.model
         data, places = mujoco.MjData(model), []
-        moved = np.flatnonzero(model.body_weldid != 0)  # terrain is a part of the world
+        moved = np.flatnonzero(model.body_weldid != 0)  # bodies welded to the world, such as terrain, are left out
         for qpos in np.nan_to_num(self.episodes.of(number)["qpos"][shown]):
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
@@ -177,7 +178,7 @@ def _jpeg(frame: Image.Image, quality: int) -> bytes:
 
 
 class Panels:
-    """The plots of one episode and their arrays."""
+    """The plots of one episode, and the arrays that the plots show."""
 
     def __init__(self, episodes: Episodes, number: int) -> None:
         self.episodes, self.one, self.joints = episodes, episodes.of(number), episodes.about["joints"]
@@ -185,9 +186,8 @@ class Panels:
         """Array -> (T, K) values."""
 
     def sections(self) -> list[dict[str, Any]]:
-        """Return the sections of the page in order: title, plots, and whether the section is open at first.
-
-        Reward parts that the task multiplies by its step are drawn per second.
+        """Return the sections of the page in order (see `_section`). If the task multiplies rewards by the control step,
+        reward parts are drawn per second.
         """
         legged, one = "command" in self.one, self.one
         if legged:
@@ -200,7 +200,7 @@ class Panels:
             note = "At the end of each control step. Dotted lines are the limits of the motors."
             found.append(self._by_joint("Torques", "torque", "max_torque", "torque", note))
         if "joint_pos" in one and self.joints:
-            note = "Dotted lines are the stops, where they are in sight."
+            note = "Dotted lines are the joints' stops, if the plot's range contains them."
             found.append(self._by_joint("Joint positions", "joint_pos", "range", "position", note))
             found.append(self._by_joint("Joint velocities", "joint_vel", "max_velocity", "velocity", "", open=False))
         if legged:
@@ -228,7 +228,7 @@ class Panels:
     def _base(self) -> dict[str, Any]:
         _, _, z, _, x, y = self.one["qpos"][:, :6].T
         self.arrays["height"] = z - self.one["ground"]
-        # The vertical part of the base's upward axis is 1 - 2 (x^2 + y^2), with x and y of its quaternion.
+        # The base's z axis has the vertical component 1 - 2 (x^2 + y^2), with x and y of the base's quaternion.
         self.arrays["tilt"] = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0)))
         height, tilt = _line("height", "height", 0, COLORS[0]), _line("tilt", "tilt", 0, COLORS[1])
         panels = [
@@ -243,7 +243,7 @@ class Panels:
         self.arrays["feet_contact"] = self.one["feet_contact"]
         self.arrays["feet_up_force"] = self.one["feet_force"][:, :, 2]
         rows = [{**line, "above": 0.5} for line in self._lines("feet_contact", without_common_words(feet))]
-        # Other shapes with a contact, at any time.
+        # Shapes other than feet are shown if they have a contact at any time.
         force = self.one["contact_force"]
         touched = [i for i, name in enumerate(contacts) if name not in feet and (force[:, i] > threshold).any()]
         self.arrays["other_force"] = force[:, touched] if touched else np.zeros((len(force), 1))
@@ -255,12 +255,12 @@ class Panels:
     # ---- all tasks --------------------------------------------------------------------------------------------------
 
     def _lines(self, series: str, labels: Sequence[str], columns: Sequence[int] | None = None) -> list[dict[str, Any]]:
-        """Return lines of those columns of a series, of all by default; `labels` are those of all columns."""
+        """Return lines of the given columns of a series, by default of all columns. `labels` are those of all columns."""
         chosen = range(len(labels)) if columns is None else columns
         return [_line(labels[i], series, i, COLORS[k % len(COLORS)]) for k, i in enumerate(chosen)]
 
     def _undriven(self, array: str, series: str, title: str, unit: str, first: int = 0) -> list[dict[str, Any]]:
-        """Return plots of generalised coordinates without a motor, from column `first` on, at most MOST_LINES in each."""
+        """Return plots, with at most MOST_LINES lines each, of coordinates without a motor, from column `first` on."""
         names, driven = self.episodes.columns(array), {joint[array] for joint in self.joints}
         columns = [i for i in range(first, len(names)) if i not in driven]
         if columns:
@@ -288,7 +288,7 @@ class Panels:
         return _section("Reward parts", [stack] if lines else [], note=note, wide=True)
 
     def _by_joint(self, title: str, name: str, limit: str, what: str, note: str, **options: Any) -> dict[str, Any]:
-        """Return a plot for each group of joints that differ only in their leg."""
+        """Return a section with a plot for each group of joints that differ only in their leg."""
         self.arrays[name], labels = self.one[name], [joint["name"] for joint in self.joints]
         panels = []
         for kind, members in groups_of(labels):
@@ -301,9 +301,8 @@ class Panels:
 
 
 def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
-    """Return the groups of joints whose names differ only in the words for a leg, in order: their common name, and
-    their numbers. A joint without such partners is a group of its own. Joints of a group with more than `MOST_LINES` form
-    separate groups.
+    """Return (common name, indices of the joints) for each group of joints whose names differ only in the words for a leg. A
+    joint without partners is a group of its own, and so is every joint of a group with more than `MOST_LINES`.
     """
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -321,7 +320,7 @@ def _line(label: str, series: str, column: int, color: str, dashed: bool = False
 
 
 def _panel(title: str, unit: str, lines: list[dict[str, Any]], **options: Any) -> dict[str, Any]:
-    """Return a plot; options are its `kind`, `height` [pixels], `limits` to draw, and values to `include` in its axis."""
+    """Return a plot. Options are its `kind`, `height` [pixels], `limits` to draw, and values to `include` in the axis."""
     usual: dict[str, Any] = {"kind": "lines", "height": 150, "limits": [], "include": []}
     return {"title": title, "unit": unit, "lines": lines, **usual, **options}
 

@@ -1,4 +1,4 @@
-"""Figures of each episode, and an order by one of them."""
+"""Figures of each episode, and the order of episodes by one of the figures."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -18,12 +18,12 @@ COLUMNS = {
     "power": ("mean power [W]", ".1f"),
     "torque": ("largest torque [% of limit]", ".0f"),
 }
-"""Name -> title and form of the figures by which episodes can be sorted, as far as a task has them."""
+"""Name of a figure by which episodes can be sorted -> title and number format. A task may lack some of the figures."""
 LOW_FIRST = ("length", "return")
-"""Figures whose smallest value is the worst."""
+"""Figures of which the smallest value is the worst."""
 FELL = "fell"
-"""Order with failed episodes first, the shortest of them at the top, then the others by tracking error or return, the worst
-first."""
+"""Name of an order: failed episodes come first, from the shortest to the longest. The others follow, sorted by tracking error
+or return, the worst first."""
 
 
 @dataclass(frozen=True)
@@ -31,20 +31,20 @@ class Figures:
     """The figures of E episodes."""
 
     values: dict[str, np.ndarray]
-    """Name of a column -> (E,), in the order of COLUMNS; only those that the task has."""
+    """Name in COLUMNS -> (E,) figures, in that order; figures that the task lacks are left out."""
     strained: list[str]
-    """The joint with the largest share of its torque limit, in each episode; empty if none has a limit."""
+    """For each episode, the joint that came closest to its torque limit; empty if no joint has a limit."""
     failed: np.ndarray
-    """(E,)"""
+    """(E,) True for episodes that ended in a failure."""
     ended: list[list[str]]
-    """Terms that ended each episode."""
+    """Names of the terms that ended each episode."""
     ends: list[str]
-    """Names of everything that can end an episode."""
+    """Names of all terms that can end an episode, and of ends without a term."""
 
 
 def figures_of(episodes: Episodes) -> Figures:
-    """Compute the figures of all episodes. Errors are root mean squares over all steps; energy is the sum of |torque *
-    velocity| at the ends of control steps, over joints and time; power is energy over the length of the episode.
+    """Compute the figures of all episodes. Errors are root mean squares over all steps. Energy is |torque * velocity| at the
+    ends of control steps, summed over joints and integrated over time. Power is energy divided by the episode's length.
     """
     numbers, strained = range(len(episodes)), []
     ends = [*episodes.about["terminations"], TIME_UP, NO_NUMBERS]
@@ -52,7 +52,7 @@ def figures_of(episodes: Episodes) -> Figures:
     def each(measure: Callable[[dict[str, np.ndarray]], float]) -> np.ndarray:
         return np.array([measure(episodes.of(i)) for i in numbers])
 
-    def rms(errors: np.ndarray) -> float:  # of the lengths of errors (T, K)
+    def rms(errors: np.ndarray) -> float:  # root mean square of the norms of errors (T, K)
         return float(np.sqrt(np.square(errors, dtype=np.float64).sum(axis=1).mean()))
 
     seconds = episodes.lengths * episodes.dt
@@ -73,7 +73,7 @@ def figures_of(episodes: Episodes) -> Figures:
 
 
 def order_of(figures: Figures, by: str, ended_by: str | None = None) -> list[int]:
-    """Return the numbers of the episodes, the worst first; with `ended_by`, only of those that this term ended.
+    """Return the numbers of the episodes, the worst first. With `ended_by`, only episodes that this term ended are listed.
 
     Raises:
         ConfigError: the task lacks that figure or that term.
@@ -102,7 +102,7 @@ def check_ended(name: str, ends: Sequence[str]) -> None:
 
 
 def listing(figures: Figures, numbers: Sequence[int]) -> tuple[list[str], list[list[str]]]:
-    """Return the heads of the list's columns, and the rows of some episodes."""
+    """Return the headings of the list of episodes, and the rows of the episodes `numbers`."""
     joint = ["joint"] if figures.strained else []
     rows = []
     for i in numbers:
@@ -113,7 +113,7 @@ def listing(figures: Figures, numbers: Sequence[int]) -> tuple[list[str], list[l
 
 
 def counts_text(figures: Figures) -> str:
-    """Return the numbers of episodes and failures, and the terms that ended episodes, as text."""
+    """Return as text how many episodes there are, how many failed, and how many each term ended."""
     counts = Counter(term for terms in figures.ended for term in terms)
     ended = ", ".join(f"{count} by {term}" for term, count in counts.most_common())
     return f"{len(figures.ended)} episodes, {int(figures.failed.sum())} failed; ended: {ended}"

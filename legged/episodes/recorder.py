@@ -1,5 +1,5 @@
-"""Recordings of a policy's episodes: the task is rebuilt with or without disturbances, and robots run whole episodes, whose
-quantities are recorded on the device at every control step and fetched in chunks.
+"""Recordings of a policy's episodes: the task is built again with or without disturbances, and robots run whole episodes. At
+every control step quantities are recorded on the device, from which they are fetched in chunks.
 """
 
 import copy
@@ -28,36 +28,36 @@ from legged.policies.episodes import Policy, unit_of
 from legged.policies.restore import TrainedPolicy, restore, undisturbed
 
 MOST_EPISODES = 4096
-"""Most episodes of a recording; at 20 s each they take some gigabytes."""
+"""Largest number of episodes of a recording. With 20 s each they take some gigabytes."""
 GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 """The golden ratio minus 1."""
 FLAGS = ("failed", "timed_out")
-"""Columns for how an episode ended, before those of the terms."""
+"""First columns of `ended`; a column for each termination term follows."""
 CHUNK_MB = 64.0
-"""Size of a chunk of steps on the device [MiB]; a chunk is fetched in one transfer."""
+"""Largest size of a chunk of steps on the device, which is fetched in one transfer [MiB]."""
 LONGEST_CHUNK = 100
-"""Most steps of a chunk; after each chunk the recorder checks whether all robots have finished."""
+"""Largest number of steps of a chunk. After each chunk the recorder checks whether all robots have finished."""
 
 
 @dataclass(frozen=True)
 class Wish:
-    """Choices of the command line."""
+    """What the command line asks a recording to be."""
 
     episodes: int
     robots: int
     as_trained: bool = False
-    """Keep noise, pushes, curricula and randomisation of the training."""
+    """True: noise, pushes, curricula and randomisation are those of the training."""
     command: tuple[float, float, float] | None = None
-    """vx, vy [m/s], yaw rate [rad/s] for all robots; commands of the training if None."""
+    """Command of all robots, vx, vy [m/s], yaw rate [rad/s]; if None, commands are drawn as in the training."""
     terrain: str | None = None
-    """Type of the tiles, as in play; without it and a difficulty, the ground of the training."""
+    """Terrain type, as in `play`. If neither type nor difficulty is given, the ground is that of the training."""
     difficulty: float | None = None
     changes: tuple[tuple[str, Any], ...] = ()
-    """Overrides, applied last."""
+    """Overrides of the user, which are applied last."""
 
 
 def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
-    """Return the chosen tiles; None if the task keeps its own ground.
+    """Check the choices, and return the playground; None if the task keeps its own ground.
 
     Raises:
         ConfigError: a choice does not fit the task.
@@ -78,8 +78,8 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
 def roll_out(
     policy: TrainedPolicy, wish: Wish, device: torch.device, graph: bool = True, where: str = "sim.physics"
 ) -> tuple[Episodes, TaskConfig]:
-    """Record a policy's episodes on `device`; return them and their task's configuration. `where` names the setting of the
-    engine in errors.
+    """Record a policy's episodes on `device`; return the episodes and the task's configuration. `where` names the setting
+    that chooses the engine, for error messages.
 
     Raises:
         ConfigError: a choice does not fit the task, or the checkpoint does not fit.
@@ -113,8 +113,8 @@ def roll_out(
 
 
 def spread(task: LeggedRobot) -> None:
-    """Put robots on tiles of all levels and types evenly, where they stay. The level of robot i is given by the fractional
-    part of i times the golden ratio, so that the levels of any few robots are far apart.
+    """Distribute robots evenly over the tiles of all levels and types. The level of robot i follows from the fractional part
+    of i times the golden ratio, so that consecutive robots have levels that are far apart.
     """
     assert task.terrain_curriculum is not None, "the task stands on a plane"
     share = torch.arange(task.num_envs, device=task.device) * GOLDEN % 1.0
@@ -130,7 +130,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
-        # Episodes keep the length of the training.
+        # Episodes are as long as in the training.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
         if playground is not None:
             own += [*SETTING, *playground.changes(cfg)]
@@ -140,7 +140,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
 
 
 def _about(task: BaseTask) -> dict[str, Any]:
-    """Return the description of the recorded arrays, which depends on the task only."""
+    """Return the part of the recording's description that depends on the task only."""
     legs: dict[str, Any] = {}
     if isinstance(task, LeggedRobot):
         robot = task.robot
@@ -174,7 +174,7 @@ def _about(task: BaseTask) -> dict[str, Any]:
 
 
 class StepRecord:
-    """A row for each robot with all recorded quantities of a step, written within the captured step."""
+    """Record of a step: a row for each robot with all quantities, written as a part of the captured step."""
 
     def __init__(self, task: BaseTask) -> None:
         self.quantities = quantities_of(task)
@@ -182,10 +182,10 @@ class StepRecord:
         self.shapes = [tuple(value.shape[1:]) for value in values]
         self.widths = [int(np.prod(shape)) for shape in self.shapes]
         self.row = torch.zeros(task.num_envs, sum(self.widths), device=task.device)
-        """(N, W) quantities of the last step of every robot, stored before any reset."""
+        """(N, W) quantities of every robot at the end of the last step, before robots are reset."""
 
     def take(self) -> None:
-        """Write the row."""
+        """Write the current quantities into the rows."""
         rows = len(self.row)
         values = [quantity.read().reshape(rows, width) for quantity, width in zip(self.quantities, self.widths, strict=True)]
         torch.cat([value.float() for value in values], dim=1, out=self.row)
@@ -200,8 +200,8 @@ class StepRecord:
 
 
 def shares_of(episodes: int, robots: int) -> np.ndarray:
-    """Return (N,) numbers of episodes of each robot. They are fixed beforehand, so that they do not depend on the lengths of
-    episodes.
+    """Return the number of episodes (N,) that each robot contributes. The numbers are fixed beforehand, so that they do not
+    depend on the lengths of episodes.
     """
     return episodes // robots + (np.arange(robots) < episodes % robots)
 
@@ -214,23 +214,23 @@ def record_episodes(
     place: Callable[[], None] | None = None,
     graph: bool = True,
 ) -> tuple[Episodes, int]:
-    """Run the first episodes of every robot, `episodes` in all, each from a reset to its end; return them, the first of every
-    robot before the second ones, and how often a robot lost contacts in a step for want of memory.
+    """Run `episodes` episodes from a reset to their end. Return them, first the first episode of every robot, then the second
+    ones, and so on; and how often a robot lost contacts in a step for want of memory.
 
-    Robot i contributes its first `shares_of(...)[i]` episodes. So no episode is cut off. Among the episodes that end first,
-    short ones would be too frequent. All robots hold `command`, vx, vy [m/s] and yaw rate [rad/s], if it is given. `place` is
-    called before the first reset to place robots. With `graph` the step is captured on a GPU.
+    Robot i contributes its first `shares_of(...)[i]` episodes, long or short. If the episodes that end first were taken
+    instead, short ones would be too frequent. All robots hold `command`, vx, vy [m/s] and yaw rate [rad/s], if it is given.
+    `place` is called before the first reset to place robots. With `graph` the step is captured on a GPU.
 
     Raises:
         TermError: the step cannot be captured.
     """
     progress = copy.deepcopy(task.progress())
     record = watch_steps(task, StepRecord(task), graph)
-    task.load_progress(progress)  # curricula went back to their start with the new step
+    task.load_progress(progress)  # watch_steps has set curricula back to their start
     if place is not None:
         place()
     physics, (n, width), shares = task.physics, record.row.shape, shares_of(episodes, task.num_envs)
-    # Behind the row of a step is the state after resets, in which the next episode may begin.
+    # The state after resets is stored behind the row of a step, because the next episode may begin in it.
     whole = width + physics.qpos.shape[1] + physics.qvel.shape[1]
     length = max(1, min(LONGEST_CHUNK, int(CHUNK_MB * 2**20 / (4 * n * whole)), task.max_episode_length))
     buffer = torch.zeros(length, n, whole, device=task.device)
@@ -250,7 +250,7 @@ def record_episodes(
             finished += chunks[-1][:, :, flags].any(axis=2).sum(axis=0)
     steps = np.concatenate(chunks)
     del chunks
-    spans = []  # episode of its robot, robot, row before the first step, last row
+    spans = []  # (number among the robot's episodes, robot, row before the first step, last row)
     for robot, share in enumerate(shares):
         ends = np.flatnonzero(steps[1:, robot, flags].any(axis=1))[:share] + 1
         spans += [(k, robot, begin, end) for k, (begin, end) in enumerate(pairwise([0, *ends.tolist()]))]
@@ -285,7 +285,7 @@ class Quantity:
     what: str
     """Description, with the frame if the quantity has one."""
     columns: tuple[str, ...] = ()
-    """Names along the second axis of the values, if there is one."""
+    """Names along the second axis of the values; empty if the values are (N,)."""
 
 
 def quantities_of(task: BaseTask) -> list[Quantity]:
@@ -310,10 +310,12 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
 
 
 def joints_of(task: BaseTask) -> list[dict[str, Any]]:
-    """Return the joints with a motor, in the order of the motors, as plain values for a JSON file: `name`; `unit` of the
-    position, rad, or m for a slide; the columns `qpos` and `qvel` of the generalised coordinates; `range`, the lowest and
-    highest position, None without stops; `max_velocity`; and `max_torque`, the largest nominal torque [N m] either way, or
-    force [N] of a slide, None without a limit. The list is empty if a motor drives something other than one joint.
+    """Return a mapping for each joint with a motor, in the order of the motors, to be written as JSON. The list is empty if a
+    motor drives something other than one joint.
+
+    The keys are `name`; `unit` of the position, rad or, for a slide, m; `qpos` and `qvel`, the columns in the generalised
+    coordinates; `range`, the lowest and the highest position, None without stops; `max_velocity`; and `max_torque`, the
+    largest nominal torque [N m] (force [N] for a slide) in either direction, None without a limit.
     """
     model = task.physics.model
     if isinstance(task, LeggedRobot):
@@ -346,7 +348,7 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
 
 
 def _of_legs(task: LeggedRobot) -> list[Quantity]:
-    """Return the quantities of legged robots."""
+    """Return the quantities that are recorded only for legged robots."""
     joints, feet, shapes = task.robot.joint_names, task.robot.feet_names, task.robot.contact_names
     columns, velocity = task.feet_indices, "m/s, m/s, rad/s"
     commanded = "velocity that was asked for in this step, base frame"
@@ -368,7 +370,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
 
 
 def _of_motors(task: BaseTask) -> list[Quantity]:
-    """Return the quantities of a model with motors on its joints; nothing for other actuators."""
+    """Return the quantities of joints with motors; an empty list if the model has other actuators."""
     model, physics, joints = task.physics.model, task.physics, joints_of(task)
     if not joints:
         return []
@@ -385,7 +387,7 @@ def _of_motors(task: BaseTask) -> list[Quantity]:
 
 
 def _all_motors(model: mujoco.MjModel) -> bool:
-    """Return whether every actuator is a motor on one hinge or slide, with a torque proportional to its control."""
+    """Return whether every actuator drives one hinge or slide with a torque or force proportional to its control."""
     if not model.nu or (model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT).any():
         return False
     kinds = model.jnt_type[model.actuator_trnid[:, 0]]
@@ -403,7 +405,7 @@ def _torque_per_control(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Return the least and the greatest control (2, nu) of every motor; infinite without a range."""
+    """Return the least and the greatest control of every motor, (2, nu); both are infinite without a range."""
     limited = model.actuator_ctrllimited[:, None].astype(bool)
     return np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf]).T
 
@@ -416,7 +418,7 @@ def _actions(task: BaseTask) -> tuple[str, ...]:
 
 
 def _coordinates(model: mujoco.MjModel, derivative: int) -> tuple[str, ...]:
-    """Return the names of the generalised positions, or with `derivative` 1 of the velocities: `<joint>.<part>`."""
+    """Return the names of generalised positions (`derivative` 0) or velocities (1) in the form `<joint>.<part>`."""
     turn = tuple(f"w{axis}" for axis in AXES) if derivative else ("qw", "qx", "qy", "qz")
     parts = {mujoco.mjtJoint.mjJNT_FREE: (*AXES, *turn), mujoco.mjtJoint.mjJNT_BALL: turn}
     found: list[str] = []

@@ -1,5 +1,5 @@
-"""Recorded episodes, in memory and as files: the arrays in episodes.npz, their description in episodes.json, and a flat table
-for tools that read Parquet. What is read may come from anywhere, so it is checked.
+"""Recorded episodes, in memory and as files: arrays in episodes.npz, their description in episodes.json, and a flat table for
+tools that read Parquet. Files may come from anywhere, so they are checked when they are read.
 """
 
 import json
@@ -19,20 +19,21 @@ from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.registry import task_schema
 
 ARRAYS, ABOUT, CONFIG, TABLE = "episodes.npz", "episodes.json", "episodes.yaml", "episodes.parquet"
-"""Files: arrays, their description, the configuration of their task, and the flat table."""
+"""Names of the files: arrays, their description, the configuration of the task, and the flat table."""
 MADE_OF_THEM = ("episodes.md", TABLE, "episode_[0-9]*.html", "joint_statistics.*")
 """Patterns of the files that are made from a recording, in the same folder."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
-"""Names for ends without a term: out of time, and physics that blew up."""
+"""Names of ends that no term stands for: the time was up, or physics blew up."""
 AXES = ("x", "y", "z")
 DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
 """Errors that json, zipfile and NumPy raise for damaged files."""
 FORMAT = 1
 """Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
-"""Arrays with a row an episode: its first row (and the row behind the last episode); the robot that ran it; flags of an end
-by a failure, of an end by time or a term that is no failure, and of all terms, in the order of `terminations`; positions and
-velocities before its first step. The other arrays have a row a control step, one episode after the other.
+"""Arrays with a row for each episode: its first row in the other arrays (and at the end their number of rows); the robot that
+ran it; flags of an end by a failure, of an end by time or by a term that is no failure, and of all terms, in the order of
+`terminations`; positions and velocities before its first step. The other arrays have a row for each control step, one episode
+after another.
 """
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 JOINTS = ("joint_pos", "joint_vel", "torque")
@@ -55,13 +56,13 @@ FORM: dict[str, Any] = {
 }
 """Form of episodes.json."""
 LEGGED_FORM = {"contact_threshold": POSITIVE, "feet": [TEXT, ...], "contacts": [TEXT]}
-"""Form of the parts that only legged robots have."""
+"""Form of those parts of episodes.json that only legged robots have."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """E whole episodes of R control steps in all. Row k of an episode holds the state at the end of control step k + 1, with
-    the action, the command and the reward of that step.
+    """E whole episodes, with R control steps in total. Row k of an episode, counted from 0, holds the state at the end of its
+    control step k + 1, with the action, the command and the reward of that step.
     """
 
     arrays: dict[str, np.ndarray]
@@ -79,16 +80,16 @@ class Episodes:
 
     @property
     def dt(self) -> float:
-        """Control step [s]."""
+        """Length of a control step [s]."""
         return float(self.about["dt"])
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """(E,) lengths in steps."""
+        """(E,) lengths of the episodes [control steps]."""
         return np.diff(self.arrays["episode_start"])
 
     def rows(self, number: int) -> slice:
-        """Return the rows of an episode."""
+        """Return the rows of an episode in the arrays with a row for each step."""
         start = self.arrays["episode_start"]
         return slice(int(start[number]), int(start[number + 1]))
 
@@ -115,8 +116,8 @@ def joint_unit(array: str, of_position: str) -> str:
 
 
 def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
-    """Write the three files into `folder`; the arrays also hold `time` [s] and `episode`. An earlier recording is replaced,
-    and files made from it are removed.
+    """Write arrays, description and configuration into `folder`; the arrays also hold `time` [s] and `episode`. An earlier
+    recording is replaced, and files that were made from it are removed.
 
     Raises:
         ConfigError, RunError: a file can't be written.
@@ -124,7 +125,7 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
     make_folder(folder)
     with replacing(folder / ARRAYS) as part:
         np.savez(part, **clock_of(episodes), **episodes.arrays)  # type: ignore[arg-type]
-        # Once the new arrays are written, the old description must not describe them if a later write fails.
+        # The old description is removed before the new arrays take their place, so that it never describes them.
         for name in (ABOUT, CONFIG, *MADE_OF_THEM):
             for path in folder.glob(name):
                 path.unlink()
@@ -133,7 +134,7 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
 
 
 def clock_of(episodes: Episodes) -> dict[str, np.ndarray]:
-    """Return `episode` (R,), the episode of each row, and `time` (R,), the time since its start [s]."""
+    """Return `episode` (R,), the number of each row's episode, and `time` (R,), the time since the episode's start [s]."""
     lengths = episodes.lengths
     steps = np.concatenate([np.arange(1, count + 1) for count in lengths])
     return {
@@ -143,7 +144,7 @@ def clock_of(episodes: Episodes) -> dict[str, np.ndarray]:
 
 
 def load_episodes(folder: Path, where: str) -> Episodes:
-    """Read the files of `save_episodes`; `where` is the flag that names the folder.
+    """Read the files that `save_episodes` wrote. `where` is the option that names the folder, for error messages.
 
     Raises:
         ConfigError: the folder holds no episodes, or damaged ones.
@@ -162,10 +163,10 @@ def load_episodes(folder: Path, where: str) -> Episodes:
 
 
 def load_config(folder: Path, where: str) -> TaskConfig:
-    """Return the configuration of the task of stored episodes.
+    """Return the configuration of the task whose episodes are stored in `folder`.
 
     Raises:
-        ConfigError: the file is missing, or no longer fits the schema.
+        ConfigError: the file is missing, or does not fit the present schema.
     """
     path = folder / CONFIG
     if not path.is_file():
@@ -175,7 +176,7 @@ def load_config(folder: Path, where: str) -> TaskConfig:
 
 
 def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
-    """Check episodes.json, and that the arrays of episodes.npz fit it: their readers rely on shapes and names. `where` names
+    """Check the contents of episodes.json, and that shapes and names of the arrays in episodes.npz fit them. `where` names
     the folder.
 
     Raises:
@@ -199,7 +200,7 @@ def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
     count = len(failed) if failed.ndim == 1 else 0
     whole = start.shape == (count + 1,) and start.dtype.kind in "iu" and count > 0
     if not whole or start[0] != 0 or (start[1:] <= start[:-1]).any():
-        raise ConfigError(f"{damaged}: episode_start does not say where {count} episodes begin")
+        raise ConfigError(f"{damaged}: episode_start does not hold the first rows of {count} episodes")
     for name, array in arrays.items():
         wanted = count + (name == "episode_start") if name in PER_EPISODE else int(start[-1])
         if array.ndim == 0 or array.dtype.kind not in "biuf" or len(array) != wanted:
@@ -222,8 +223,8 @@ def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
 
 
 def write_parquet(episodes: Episodes, folder: Path) -> None:
-    """Write TABLE into `folder`, a row a control step. Its columns are episode, time [s], and those of all arrays by name,
-    `torque.LF_HAA` or `feet_force.LF_FOOT.x`.
+    """Write TABLE into `folder`, with a row for each control step. Its columns are episode, time [s], and the columns of all
+    arrays, with names such as `torque.LF_HAA` and `feet_force.LF_FOOT.x`.
 
     Raises:
         RunError: the file can't be written.

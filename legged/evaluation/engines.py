@@ -7,7 +7,7 @@ from legged.config.schema import NewtonSolver
 
 
 class Engine(NamedTuple):
-    """An engine, or a solver of Newton: its name in tables, and the settings that choose it."""
+    """An engine, or one of Newton's solvers: the name in tables, and the overrides that choose the engine."""
 
     label: str
     overrides: Sequence[tuple[str, Any]] = ()
@@ -21,15 +21,15 @@ ENGINES = {
         for name in get_args(NewtonSolver)
     },
 }
-"""Every engine, by its name from `legged.physics.engine_name`."""
+"""Name from `legged.physics.engine_name` -> engine."""
 
 
 def engine_of(name: str) -> Engine:
-    """Return the engine of that name; an unknown engine is labelled by its name."""
+    """Return the engine called `name`; an unknown engine is labelled with that name."""
     return ENGINES.get(name, Engine(name))
 
 
 def by_engine(results: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return engine -> its result, in the order of ENGINES, others last."""
+    """Return name of the engine -> its result, in the order of ENGINES; other engines come last."""
     found = {result["physics"]: result for result in results}
     return {name: found[name] for name in sorted(found, key=lambda name: [*ENGINES, name].index(name))}

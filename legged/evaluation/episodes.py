@@ -22,9 +22,9 @@ from legged.process.paths import relative
 from legged.registry import task_class
 
 MOST_EPISODES = 2**16
-"""Most episodes at once."""
+"""Largest number of episodes that are simulated at once."""
 GYMNASIUM = "gymnasium"
-"""Name of Gymnasium in files and tables, like that of an engine."""
+"""Name that stands for Gymnasium where files and tables name an engine."""
 REWARD = "reward_"
 """Prefix of the names of reward parts that Gymnasium returns with each step."""
 
@@ -51,8 +51,8 @@ def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
     episodes with the seeds 0, 1, ..., print a table and write evaluation_gymnasium.json. Return the exit code.
 
     Raises:
-        ConfigError: the task's class names no environment (`GYMNASIUM_ID`), or Gymnasium has no such environment, or one with
-            other observations or actions.
+        ConfigError: the task's class names no environment (`GYMNASIUM_ID`), Gymnasium has no environment of that name, or
+            the environment has other observations or actions than the policy.
         RunError: Gymnasium fails, or a file can't be written.
     """
     start = time.perf_counter()
@@ -82,11 +82,11 @@ def _report(result: dict[str, Any], folder: Path) -> None:
 
 @torch.inference_mode()
 def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
-    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium. Return the form of `measure_episodes`,
-    with Gymnasium's returns and the reward parts that it names as terms.
+    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium. Return a mapping like that of
+    `measure_episodes`. Its returns are Gymnasium's, and its terms are the reward parts that Gymnasium names.
 
     Raises:
-        ConfigError: there is no such environment, or it has other observations or actions.
+        ConfigError: there is no such environment, or it has other observations or actions than the policy.
     """
     import gymnasium
 

@@ -25,19 +25,19 @@ from legged.tables import screen_table
 from legged.terrain import BUMPS
 
 EVERYWHERE = "all"
-"""Value of --physics for all engines."""
+"""Value of --physics that stands for all engines."""
 WALKING_RMSE = 0.15
-"""Largest velocity RMSE of a robot that walks, by default [m/s]."""
+"""Default velocity RMSE below which a policy counts as walking [m/s]."""
 WALKING_FALLS = 0.01
-"""Largest share of falls of a robot that walks, by default."""
+"""Default share of falls below which a policy counts as walking."""
 
 
 def evaluate_following(
     setting: Setting, grid: Grid | None, sizes: Mapping[str, Sequence[float]] | None = None, robots: int = 0
 ) -> int:
-    """Measure tracking on the grid, if there is one, and success at all `sizes` of each terrain type with `robots` a size.
-    Print tables, then write evaluation_<physics>.json and .png and success_<physics>.png. Return the exit code. A part that
-    is not measured stays in the file if it is of the same checkpoint.
+    """Measure tracking on the grid, if one is given, and success on terrain with `robots` robots for each of the
+    `sizes` of each terrain type. Print tables, write evaluation_<physics>.json and .png and success_<physics>.png, and return
+    the exit code. A part that is not measured now is kept from an older file of the same checkpoint.
 
     Raises:
         RunError: a file can't be written.
@@ -50,7 +50,7 @@ def evaluate_following(
         tracking = measure_tracking(task, act, grid)
         if setting.policy.cfg.terrain.mesh_type != "plane":  # type: ignore[attr-defined]
             tracking = {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **tracking}}
-        del task, act  # a GPU may not hold two
+        del task, act  # a GPU may not have the memory for two tasks
     success = success_over_difficulty(setting, sizes, robots) if sizes else None
     # Results are printed first, so that a full disk cannot lose them.
     shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
@@ -82,8 +82,8 @@ def evaluate_following(
 
 
 def cross(setting: Setting, grid: Grid) -> int:
-    """Measure the grid in every engine, the C engine on the CPU; print and draw. crossing.json is written after every engine.
-    Return the exit code.
+    """Measure the grid in every engine (the C engine runs on the CPU), write crossing.json after each of them, then print and
+    draw the results. Return the exit code.
     """
     path, failure = setting.folder / "crossing.json", None
     result: dict[str, Any] = {
@@ -101,7 +101,7 @@ def cross(setting: Setting, grid: Grid) -> int:
         try:
             write_result(path, result)
             failure = None
-        except RunError as error:  # the table is still printed, and the disk may have room later
+        except RunError as error:  # go on: the table can still be printed, and the disk may have room later
             failure = error
     Console(width=110).print(crossing_table(result))
     if failure is not None:
@@ -112,7 +112,7 @@ def cross(setting: Setting, grid: Grid) -> int:
 
 
 def _measured(setting: Setting, grid: Grid) -> dict[str, Any]:
-    """Return the figures of one engine; steps/s is that of the evaluation loop, without start-up and compilation."""
+    """Return the figures of one engine. `steps_per_s` is measured without start-up and compilation."""
     print(f"{setting.engine}: {grid.size_text}", flush=True)
     task, act = ready_to_track(setting, grid)
     start = time.perf_counter()
@@ -173,20 +173,21 @@ def draw_crossing(result: dict[str, Any], path: Path) -> None:
 
 
 def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING_RMSE, falls: float = WALKING_FALLS) -> int:
-    """Measure every checkpoint in the policy's folder on the grid, print a line for each, and name the first that walks: with
-    a mean velocity RMSE below `rmse` [m/s] and a share of falls below `falls`. Write time_to_walk.json; return the exit code.
+    """Measure every checkpoint in the policy's folder on the grid, print a line for each, and name the first that walks. A
+    policy walks if its mean velocity RMSE is below `rmse` [m/s] and its share of falls below `falls`. Write
+    time_to_walk.json; return the exit code.
 
-    Seconds are wall time from the start of the process that wrote the checkpoint, imports and all.
+    The times are wall time [s] since the start of the process that wrote the checkpoint, including imports.
 
     Raises:
-        ConfigError: a checkpoint holds no time; nothing is measured then.
+        ConfigError: a checkpoint does not hold its time. Then nothing is measured.
         RunError: the file can't be written.
     """
     there: dict[Path, float] = {}
     for path in checkpoints(setting.policy.folder).values():
         written_s = (read_checkpoint(path).get("infos") or {}).get("wall_s")
         if not isinstance(written_s, int | float):
-            raise ConfigError(f"{relative(path)}: says nothing of the time it was written at")
+            raise ConfigError(f"{relative(path)}: holds no time at which it was written")
         there[path] = float(written_s)
     task, act = ready_to_track(setting, grid)
     rows: list[dict[str, Any]] = []
@@ -224,5 +225,5 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
 
 
 def walks(row: dict[str, Any], rmse: float, falls: float) -> bool:
-    """Return whether a checkpoint walks; a checkpoint whose robots all fell has no error."""
+    """Return whether a checkpoint walks: both figures are below their limits. It has no error if all its robots fell."""
     return row["rmse_lin"] is not None and row["rmse_lin"] < rmse and row["falls"] < falls

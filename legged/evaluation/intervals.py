@@ -1,4 +1,4 @@
-"""Intervals of 95 % around measured shares and means, and around differences of two."""
+"""95 % confidence intervals of measured shares and means, and of the difference of two shares or two means."""
 
 from collections.abc import Sequence
 from math import sqrt
@@ -6,27 +6,27 @@ from math import sqrt
 import numpy as np
 
 Z95 = 1.959964
-"""Quantile of the normal distribution [standard deviations]."""
+"""0.975 quantile of the standard normal distribution."""
 DRAWS = 2000
-"""Samples of a bootstrap."""
+"""Number of resamples of a bootstrap."""
 
 FEWEST = 2
-"""Fewest values of an interval; the spread of a single value is not known."""
+"""Least number of values for an interval, because the spread of a single value is not known."""
 
 Interval = tuple[float, float]
 
 
 def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
-    """Return Wilson's score interval of a share (E. B. Wilson 1927): never outside [0, 1], never empty at 0 or 100 %."""
+    """Return Wilson's score interval of a share (E. B. Wilson 1927). It lies in [0, 1], with a width at 0 and 100 % too."""
     share, scale = successes / trials, 1.0 + z**2 / trials
     middle = (share + 0.5 * z**2 / trials) / scale
     half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # contains the share in spite of rounding
+    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # it must contain the share
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
-    """Return the interval of the difference second - first of two shares, each (successes, trials), from the Wilson intervals
-    of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
+    """Return the interval of the difference `second` - `first` of two shares, each (successes, trials), from the Wilson
+    intervals of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
     """
     (a, (a_low, a_high)), (b, (b_low, b_high)) = ((n / of, wilson(n, of)) for n, of in (first, second))
     return (
@@ -36,9 +36,9 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
 
 
 def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
-    """Return the mean of equally weighted shares, each (successes, trials), and its interval from their Wilson intervals:
-    squared distances to their ends add (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008). The interval has a width
-    even if all shares are 0 or 100 %.
+    """Return the mean of equally weighted shares, each (successes, trials), and its interval. Their Wilson intervals are
+    combined by adding squared distances to their ends (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so the
+    interval has a width even if all shares are 0 or 100 %.
     """
     found = [(n / of, *wilson(n, of)) for n, of in shares]
     mean = sum(share for share, _, _ in found) / len(found)
@@ -47,8 +47,8 @@ def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
 
 
 def normal_mean(mean: float, std: float, count: int) -> Interval | None:
-    """Return the interval of a mean over `count` values, from their sample standard deviation and the normal distribution;
-    None for fewer than two values.
+    """Return the interval of a mean over `count` values with the sample standard deviation `std`, by the normal
+    distribution. Return None for fewer than two values.
     """
     if count < FEWEST:
         return None
@@ -57,9 +57,9 @@ def normal_mean(mean: float, std: float, count: int) -> Interval | None:
 
 
 def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval | None:
-    """Return the interval of the difference second - first of two means, each (mean, sample standard deviation, count), whose
-    standard deviations may differ (B. L. Welch 1947), by the normal distribution, because counts are large. Return None if a
-    mean has fewer than two values.
+    """Return the interval of the difference `second` - `first` of two means, each (mean, sample standard deviation, count).
+    The standard deviations may differ (B. L. Welch 1947). Counts are large, so the normal distribution takes the place of
+    Student's. Return None if a mean has fewer than two values.
     """
     if min(first[2], second[2]) < FEWEST:
         return None

@@ -1,4 +1,4 @@
-"""Values of JSON files that may come from anywhere, checked against the form that their readers rely on."""
+"""Checks of values from JSON files, which may come from anywhere, against the form that the readers of a file rely on."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -22,9 +22,11 @@ class OrNull:
 
 
 def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str = "") -> None:
-    """Check a value, which stands at `path` in its file. `form` is one of the constants above, a set of allowed values, an
-    `OrNull`, a list [form] or [form, ...] (with at least one entry), a tuple of forms (a list of that length), or a mapping
-    of names to forms; a name that ends in ? may be absent. `or_null` is added to the allowed values in a message.
+    """Check a value, which stands at `path` in its file.
+
+    `form` is one of the constants above, a set of allowed values, or an `OrNull`. A list of values is described by [form], by
+    [form, ...] if it may not be empty, or by a tuple with a form for each entry. A mapping is described by names and forms;
+    a name that ends in ? may be absent. `or_null` is added to the allowed values in a message.
 
     Raises:
         ConfigError: the value has another form. The message begins with `damaged`, which names the file and its damage.
@@ -65,6 +67,6 @@ def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str
 
 
 def wrong_form(damaged: str, path: str, wanted: str, value: Any) -> ConfigError:
-    """Return the error for a value that is not as `wanted`."""
+    """Return the error for a value that has another form than `wanted`."""
     given = "nothing" if value is None or value is ABSENT else f"{type(value).__name__} {str(value)[:40]!r}"
     return ConfigError(f"{damaged}: {path}: expected {wanted}, got {given}")

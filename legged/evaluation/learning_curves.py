@@ -1,4 +1,4 @@
-"""The TensorBoard files of runs: read, labelled, averaged, and drawn as charts of one run or of several."""
+"""Learning curves: the scalars in the TensorBoard files of runs, and charts of one run or of several runs."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -16,11 +16,11 @@ from legged.figures import COLORS
 from legged.learning.run_folder import CONFIG_FILE
 
 SAME_TIME = 0.05
-"""Share by which the iterations of runs may differ in time for the runs to have one time axis."""
+"""Largest relative difference between the runs' times of an iteration with which the runs share a time axis."""
 MOST_PARTS = len(COLORS) - 1
-"""Reward parts with their own colour; the smaller ones are summed."""
+"""Largest number of reward parts with their own colour; the smaller parts are summed."""
 EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
-"""Beginnings of tags; `WATCHED` begins those of evaluations during training."""
+"""Prefixes of tags; `WATCHED` is the prefix of evaluations during training."""
 SINGLE = ("Metrics/lin_vel_rmse", "Metrics/ang_vel_rmse", "Metrics/falls")
 CURRICULUM = ("Metrics/command_vx", "Metrics/command_vy", "Metrics/command_yaw")
 LEARNER = ("Policy/mean_std", "Loss/value", "Loss/behavior")
@@ -41,7 +41,7 @@ TITLES = {
     "Evaluation/return": ("evaluated: return of an episode", 1.0),
     "Evaluation/episode_length": ("evaluated: length of an episode [control steps]", 1.0),
 }
-"""Tag -> title and factor of its chart. Other tags of charts are metrics of the task, which are titled by their names."""
+"""Tag -> title of its chart and factor on its values. The charts of other tags are titled with the tag's name."""
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values."""
 Scalars = dict[str, Curve]
@@ -96,8 +96,8 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a label for each run: task, run name and seed. Without a configuration the label is the folder's name; where two
-    labels would be equal, the folder's name is added.
+    """Return a label for each run: task, run name and seed. Without a configuration the label is the folder's name. If two
+    labels would be equal, the folder's name is added to both.
     """
     found, names = [], [folder.resolve().name for folder in folders]
     for folder, config in zip(names, configs, strict=True):
@@ -109,8 +109,9 @@ def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[s
 
 
 def always_promoted(config: dict[str, Any]) -> float | None:
-    """Return the mean level of robots that are always promoted on terrain of R rows: 2 (R - 1) / 3. From the top row they
-    move to a random one, so row r holds robots in proportion to r + 1. Return None if R is not known.
+    """Return the mean terrain level that robots reach if they are always promoted, on terrain of R rows: 2 (R - 1) / 3. From
+    the top row robots move to a random row, so the number of robots in row r is proportional to r + 1. Return None if R is
+    not known.
     """
     rows = value_at(config, "terrain.num_rows")
     return 2.0 * (rows - 1) / 3.0 if isinstance(rows, int) else None
@@ -136,21 +137,21 @@ def common(curves_of: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mean_of(runs: list[Scalars], tag: str) -> Curve:
-    """Return the iterations, counted from 1, that all runs with this tag have, and the mean over the runs."""
+    """Return the mean curve of all runs that have this tag, at the iterations that they share, counted from 1."""
     steps, values = common([run[tag] for run in runs if tag in run])
     return steps + 1, values.mean(axis=0) if len(steps) else steps
 
 
 def times_of(scalars: Scalars) -> Curve:
-    """Return the time of each iteration of the training loop [s]; an empty curve if times were not logged."""
+    """Return the curve of the time that each iteration takes [s]; the curve is empty if times were not logged."""
     parts = [scalars[tag] for tag in ("Perf/collection_time", "Perf/learning_time") if tag in scalars]
     steps, seconds = common(parts if len(parts) == 2 else [])
     return steps, seconds.sum(axis=0)
 
 
 def common_time(runs: Collection[Scalars]) -> float | None:
-    """Return the mean time of an iteration [s] of the first run that has logged times. Return None if no run has, or if times
-    of runs differ by more than `SAME_TIME`.
+    """Return the mean time of an iteration [s] in the first run that logged times. Return None if no run logged times, or if
+    the means of the runs differ by more than `SAME_TIME`.
     """
     found = [float(seconds.mean()) for _, seconds in map(times_of, runs) if seconds.size]
     alike = bool(found) and min(found) > 0.0 and max(found) <= (1.0 + SAME_TIME) * min(found)
@@ -161,14 +162,14 @@ def common_time(runs: Collection[Scalars]) -> float | None:
 
 
 def curves_of_run(log: Log) -> list[str]:
-    """Return the drawings of one run."""
+    """Return all charts of one run, as SVG."""
     run, parts = [("", log)], _parts(log.scalars)
     drawings = [curves(chart) for chart in (*outcomes(run), *_learner(run), *levels([log]))]
     return [*drawings[:1], *([parts] if parts else []), *drawings[1:]]
 
 
 def curves_of_runs(runs: Named) -> list[str]:
-    """Return the drawings of several runs laid over each other."""
+    """Return charts with the curves of several runs in the same axes, as SVG."""
     return [curves(chart) for chart in (*outcomes(runs), *_learner(runs), *_one("Terrain/level", "mean terrain level", runs))]
 
 
@@ -212,8 +213,8 @@ def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
 def _one(
     tag: str, title: str, runs: Named, factor: float = 1.0, exact: bool = False, markers: bool = False, **look: Any
 ) -> list[Chart]:
-    """Return the chart of one quantity, a line for each run, as running means unless `exact`; no chart if no run logged
-    it.
+    """Return a list with the chart of one quantity, with a line for each run; an empty list if no run logged the quantity.
+    Lines are running means unless `exact`.
     """
     lines = []
     for i, (label, run) in enumerate(runs):
@@ -225,7 +226,7 @@ def _one(
 
 
 def _returns(runs: Named) -> list[Chart]:
-    """Return the chart of returns; of one run with the standard deviation over episodes as a band."""
+    """Return the chart of returns. If there is only one run, a band shows the standard deviation over episodes."""
     charts = _one("Train/mean_reward", "return of an episode", runs)
     std = runs[0][1].scalars.get("Train/std_reward")
     if not charts or len(runs) > 1 or std is None:
@@ -238,7 +239,7 @@ def _returns(runs: Named) -> list[Chart]:
 
 
 def _parts(scalars: Scalars) -> str:
-    """Return the drawing of the parts of the reward on top of each other; an empty text if none was logged."""
+    """Return a chart (SVG) of the stacked reward parts; an empty text if no part was logged."""
     names = [tag.removeprefix(EPISODE) for tag in scalars if tag.startswith(EPISODE)]
     steps, values = common([scalars[EPISODE + name] for name in names])
     smoothed = [smooth(part) for part in values]
@@ -255,8 +256,8 @@ def _parts(scalars: Scalars) -> str:
 
 
 def levels(logs: Sequence[Log]) -> list[Chart]:
-    """Return charts of the terrain levels by type, and of the shares of episodes after which robots move up or down, as means
-    over the runs; no chart without a curriculum of terrain.
+    """Return charts of the terrain level by type, and of the shares of episodes after which a robot moves up or down. Values
+    are means over the runs. There is no chart without a terrain curriculum.
     """
     scalars = [log.scalars for log in logs]
     types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]

@@ -1,4 +1,4 @@
-"""Parts that all measurements of a policy share: their setting, the head of their result, and contacts that were lost."""
+"""What all measurements of a policy share: the setting, the head of the result, and the count of lost contacts."""
 
 import sys
 from collections.abc import Sequence
@@ -27,18 +27,18 @@ class Setting:
     overrides: Sequence[tuple[str, Any]] = ()
     """Overrides of the command line."""
     graph: bool = True
-    """False: steps are run eagerly instead of as CUDA graphs."""
+    """True: on a GPU, steps run as CUDA graphs. False: steps run eagerly."""
     where: str = "sim.physics"
-    """The argument that names the engine, for errors."""
+    """Name of the argument that chooses the engine, for error messages."""
 
     @property
     def asked(self) -> list[tuple[str, Any]]:
-        """The overrides, with the engine of the device in place of the training's."""
+        """The overrides, preceded by the default engine of the device, which replaces the engine of the training."""
         return [("sim.physics", resolve_physics("auto", self.device)), *self.overrides]
 
     @cached_property
     def cfg(self) -> Any:
-        """The policy's configuration with these overrides."""
+        """The policy's configuration with the overrides in `asked`."""
         return override(self.policy.cfg, self.asked)
 
     @property
@@ -46,25 +46,27 @@ class Setting:
         """Name of the engine and its solver.
 
         Raises:
-            ConfigError: the device or the machine has no such engine.
+            ConfigError: the engine does not run on the device, or is not installed.
         """
         return engine_name(self.cfg.sim, self.device, self.where)
 
     @property
     def head(self) -> dict[str, Any]:
-        """The fields with which every result begins, without the changes."""
+        """The first fields of every result; `changes` is not among them."""
         what = {"task": self.policy.cfg.task, "checkpoint": self.policy.checkpoint.name}
         return {**what, "physics": self.engine, "device": device_name(self.device)}
 
     @property
     def changes(self) -> dict[str, Any]:
-        """The field `changes` of a result, with the overrides that change its conditions; empty without such overrides."""
+        """{"changes": field -> value of the overrides that change the conditions}; empty if none does."""
         changes = changes_of(self.overrides)
         return {"changes": changes} if changes else {}
 
 
 class Overflows:
-    """Counter of lost contacts: robots times control steps. The task's own count restarts with every rollout that it logs."""
+    """Number of pairs of a robot and a control step in which contacts were lost. It sums the task's own counts, which start
+    from zero with every logged rollout.
+    """
 
     NAME = "Metrics/contact_overflows"
 
@@ -77,7 +79,7 @@ class Overflows:
             self._logged.append(extras["log"][self.NAME])
 
     def total(self, task: BaseTask) -> int:
-        """Return the count since the task was reset; it can be read once."""
+        """Return the number since the task was reset. It can be read only once."""
         return int(sum(self._logged, task.metrics.flush()[self.NAME]))
 
 

@@ -1,4 +1,4 @@
-"""A policy in C MuJoCo: one robot on a plane, one command after the other."""
+"""Playback of a policy in C MuJoCo: one robot on a plane, one command after another."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -14,15 +14,15 @@ from legged.policies.foreign import ForeignPolicy
 from legged.robots.robot import Robot
 
 SETTLING_S = 2.0
-"""Time of a single command after which velocities are measured [s]."""
+"""Time after the start of a command from which on velocities are measured [s]."""
 FALLEN = 1.0
 """Tilt of the base that counts as a fall [rad]."""
 SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
-"""Solver settings: pyramidal cones, iterated to convergence."""
+"""Solver settings: pyramidal friction cones, and enough iterations to converge."""
 
 
 class Moment(NamedTuple):
-    """A robot at the end of a control step."""
+    """State of a robot at the end of a control step."""
 
     time: float
     """Time since the start [s]."""
@@ -34,7 +34,7 @@ class Moment(NamedTuple):
 
 
 class Stage:
-    """A robot on a plane, driven by a policy through its layout."""
+    """A robot on a plane, controlled by a policy whose layout of observations and actions is known."""
 
     def __init__(self, robot: Robot, policy: ForeignPolicy, friction: float) -> None:
         """Build the model with `friction` between robot and ground."""
@@ -46,8 +46,8 @@ class Stage:
         self._start = _standing(self.model, robot, policy)
 
     def walk(self, command: np.ndarray, seconds: float) -> Iterator[Moment]:
-        """Yield each control step of a walk of `seconds` from the default pose with the feet on the ground; a fall ends it.
-        `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
+        """Yield a moment for each control step of a walk, starting in the default pose with the feet on the ground. The walk
+        ends after `seconds` or with a fall. `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
         """
         model, policy, data = self.model, self.policy, mujoco.MjData(self.model)
         data.qpos[:] = self._start
@@ -74,10 +74,11 @@ class Stage:
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[dict[str, Any]]:
-    """Play every command for `seconds`, from the default pose with the feet on the ground, at that friction. Return for each
-    the `command`, the mean `velocity` after SETTLING_S in the base frame [m/s, m/s, rad/s], the lowest height of the base in
-    that time [m], as `lowest_base`, and the time of the fall [s], as `fell_after`. The time is None without a fall, the
-    velocity and the height are None after one.
+    """Play every command for `seconds` at the given friction, from the default pose with the feet on the ground.
+
+    Return for each command a mapping: `command`; `velocity`, the mean after SETTLING_S in the base frame [m/s, m/s, rad/s];
+    `lowest_base`, the least height of the base after SETTLING_S [m]; and `fell_after`, the time of a fall [s]. Without a fall
+    `fell_after` is None; with a fall `velocity` and `lowest_base` are None.
     """
     stage, rows = Stage(robot, policy, friction), []
     for command in commands:
@@ -92,9 +93,9 @@ def play(
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
-    """Return the errors on the commands of the grid, one robot for each. Errors of the horizontal velocity [m/s] and of the
-    yaw rate [rad/s] are root mean squares over the control steps after `grid.settle_s`, up to a fall. The result has their
-    mean and worst cell, the share of falls, and in "cells" the same for each command.
+    """Return the errors on the commands of the grid, with one robot for each command. Errors of the horizontal velocity [m/s]
+    and of the yaw rate [rad/s] are root mean squares over the control steps after `grid.settle_s`, up to a fall. The result
+    holds mean and worst cell of both errors, the share of falls, and in "cells" the errors and the fall of each command.
     """
     stage, cells, rows = Stage(robot, policy, friction), grid.cells, []
     for command in cells:
@@ -126,7 +127,7 @@ def _base(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _make_servos(model: mujoco.MjModel, policy: ForeignPolicy) -> None:
-    """Turn the motors of a model, in place, into position actuators whose gains the integrator takes into account."""
+    """Turn the motors of a model, in place, into position actuators; the integrator treats their damping implicitly."""
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
     model.actuator_gainprm[:, 0] = policy.stiffness
@@ -142,7 +143,7 @@ def _standing(model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy) -> np.
     data.qpos[:] = robot.default_qpos
     data.qpos[list(robot.qpos_columns)] = policy.default
     low, high = 0.0, 10.0 * robot.file.spawn_height
-    for _ in range(40):  # from this height on, nothing touches the ground
+    for _ in range(40):  # bisection: `high` becomes the least height at which nothing touches the ground
         data.qpos[2] = 0.5 * (low + high)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)

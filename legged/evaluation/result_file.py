@@ -1,4 +1,4 @@
-"""The file of an evaluation's result, checked when it is read, because it may come from anywhere."""
+"""Files with the results of evaluations. A file is checked when it is read, because it may come from anywhere."""
 
 import json
 import math
@@ -13,14 +13,14 @@ from legged.evaluation.json_forms import ANY, NUMBER, TEXT, OrNull, check_form
 from legged.process.paths import make_folder, write_text
 
 CHANGED = "changed"
-"""Folder next to a policy's own results, for evaluations with changed fields."""
+"""Name of the folder for evaluations with changed fields; it lies next to the policy's other results."""
 SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num_envs", "robot")
 """Fields that do not change the conditions of an evaluation."""
 SECTIONS_THAT_SAY_NOTHING = ("train.", "evaluation.")
-"""Sections of such fields; a result holds its grid of commands itself."""
+"""Sections that do not change the conditions either; the grid of commands is stored in the result itself."""
 
 BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
-"""Errors raised by a file that lacks a part of an evaluation."""
+"""Errors that reading a result raises if the file lacks a part."""
 
 ERRORS = {"mean": OrNull(NUMBER), "worst": OrNull(NUMBER)}
 SPREAD = dict.fromkeys(("mean", "std", "min", "max"), NUMBER)
@@ -55,8 +55,8 @@ def stress_name(engine: str) -> str:
 
 
 def kept_parts(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the parts of the result at `path` after its head, if its head is the same, policy's file included; an empty
-    mapping otherwise.
+    """Return the parts of the result at `path` that follow its head. Return an empty mapping if its head, which names the
+    checkpoint, differs from `head`.
     """
     try:
         old = json.loads(path.read_text(encoding="utf-8"))
@@ -72,7 +72,7 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
     """Read the results in files and folders, each file once.
 
     Raises:
-        ConfigError: a path does not exist, holds no evaluation, or is no evaluation.
+        ConfigError: a path does not exist, or a folder or a file holds no evaluation.
     """
     results: dict[Path, dict[str, Any]] = {}
     for path in paths:
@@ -90,7 +90,7 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
 
 
 def check_result(result: Any, where: str) -> None:
-    """Check the fields of an evaluation that comparisons read; `where` names its file.
+    """Check those fields of a result that comparisons read; `where` names the file.
 
     Raises:
         ConfigError: a field is missing or has another type.
@@ -117,12 +117,12 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
 
 
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a result with the errors on the grid of commands."""
+    """Return the part of a result that holds the errors on the grid of commands."""
     return result.get("rough", result)
 
 
 def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
-    """Return the number of robots of a command grid that fell, and of all; None if the file lacks them."""
+    """Return the number of robots on a command grid that fell, and the number of all robots; None if the file lacks them."""
     try:
         robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
         return (round(tracking["falls"] * robots), robots) if robots > 0 else None

@@ -1,9 +1,9 @@
 """Success over difficulty, measured, printed and drawn: the share of robots that walk out of tiles of each terrain type.
 
-Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5. Robots start in the middle of a tile and keep their
-heading; commands are 0.75 m/s forward and up to 0.1 m/s sideways. Sizes go beyond those of training. `Scores` defines
-success. These numbers hold for a robot half a metre high: lengths scale with `terrain.scale`, velocities with its square root
-(constant Froude number).
+Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5; the largest sizes are harder than those of training.
+Robots start in the middle of a tile and keep their heading, with commands of 0.75 m/s forward and up to 0.1 m/s sideways.
+`Scores` defines success. The numbers here are for a robot half a metre high. For other robots lengths are multiplied by
+`terrain.scale` and velocities by its square root (constant Froude number).
 """
 
 import gc
@@ -45,14 +45,14 @@ DISTANCE = 4.0
 TIME_S = 20.0
 """Time limit for this distance [s]."""
 FORWARD, SIDEWAYS = 0.75, 0.1
-"""Commanded velocity: forward, and the largest to either side [m/s]."""
+"""Commanded forward velocity, and the largest commanded velocity to either side [m/s]."""
 SPAWN_RANGE = 0.1
-"""Robots start at most this far from the middle of their tile, in x and in y, so that their starts differ [m]."""
+"""Largest distance of a robot's start from the middle of its tile, in x and in y [m]."""
 OF_STEPS = (
     *("stairs_up", "stairs_down", "step", "obstacles"),
     *("narrow_stairs_up", "narrow_stairs_down", "dense_blocks", "kerbs", "rubble"),
 )
-"""Types that are measured by the height of their steps."""
+"""Terrain types whose size is the height of their steps."""
 SIZES: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (5.0, 10.0, 15.0, 20.0, 22.0, 25.0, 30.0, 35.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (5.0, 10.0, 15.0, 20.0, 25.0)),
@@ -63,20 +63,20 @@ SIZES: dict[str, tuple[float, ...]] = {
     "stepping_stones": (0.2, 0.3, 0.45, 0.75, 1.05, 1.35),
     "flat": (0.0,),
 }
-"""Type -> all sizes that are measured, in the type's unit."""
+"""Terrain type -> the sizes that are measured with `--full`, in the type's unit."""
 FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (10.0, 20.0, 25.0, 30.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (10.0, 20.0, 25.0)),
     **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
-"""Type -> the sizes that are measured without `--full`, where they are fewer."""
+"""Terrain type -> the sizes that are measured without `--full`, for types with fewer sizes then."""
 SMALLEST = 0.001
-"""Smallest size [m] or [degrees]."""
+"""Smallest size that can be asked for, in the type's unit."""
 MOST_SIZES = 100
-"""Most sizes of one type; all their tiles lie in one map."""
+"""Largest number of sizes of a type; the tiles of all its sizes lie in one height map."""
 TYPES_HELP = (
-    "terrain types to cross, with sizes of your own if you like: stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05; those of the"
-    " training by default"
+    "terrain types to cross, by default those of the training; a size or a range of sizes may follow a type, e.g."
+    " stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05"
 )
 
 REACHED, FELL, STUCK = range(3)
@@ -88,26 +88,26 @@ PANELS = {
     "slopes": ("slope_up", "slope_down"),
     "rough slopes": ("rough_slope_up", "rough_slope_down"),
 }
-"""Types that share a panel; every other type has its own."""
+"""Title of a panel -> terrain types that share it; every other type has its own panel."""
 
 
 class Scores:
     """The first event of each of N robots: it gets far enough from its start, it falls (the task terminates it), or its time
-    is up, by this clock or by a time-out of the task. Later events do not count.
+    is up, after TIME_S or by a time-out of the task. Later events do not count.
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
-        """Take robots that stand at `start` (N, 2 or more), world frame [m], and have to get `distance` away [m]."""
+        """Take robots that start at `start` (N, 2 or more), world frame [m], and succeed at a `distance` from there [m]."""
         self._start, self._distance = start[:, :2].clone(), distance
         self._open = torch.ones(len(start), dtype=torch.bool, device=start.device)
         self.outcome = torch.full((len(start),), STUCK, device=start.device)
-        """(N,) REACHED, FELL, or STUCK, which robots without an event are too."""
+        """(N,) REACHED, FELL or STUCK; robots without an event so far are STUCK."""
         self.time_s = torch.full((len(start),), TIME_S, device=start.device)
         """(N,) time of the event [s]."""
 
     def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor) -> None:
-        """Update the outcomes after a control step that ends at `time_s` [s]: bases at (N, 3), failures (N,), time-outs of
-        the task (N,).
+        """Update the outcomes after the control step that ends at `time_s` [s], from the positions of the bases (N, 3), world
+        frame [m], and the flags of robots that failed (N,) or timed out (N,) in this step.
         """
         # A robot whose episode ended in this step is back at its start already, so its position does not count.
         ended = terminated | timed_out
@@ -119,7 +119,7 @@ class Scores:
 
     @property
     def done(self) -> bool:
-        """True if every robot had its event."""
+        """True if every robot has had its event."""
         return not bool(self._open.any())
 
 
@@ -127,20 +127,19 @@ class Scores:
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of a type on ground of that scale, in its unit, in ascending order."""
+    """Return the sizes of a terrain type, in its unit and in ascending order, for ground with that `terrain.scale`."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
-    # A type that is not listed has the sizes of training and one step more.
+    # A type that is not listed is measured at the sizes of difficulties up to 1, the hardest of training, and at one more.
     found = found or tuple(sorted(kind.size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
     return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 6) for size in found)
 
 
 def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float) -> dict[str, tuple[float, ...]]:
-    """Return type -> sizes in its unit, in ascending order: for the types in the comma-separated list `asked`, else for those
-    of the training (none on a plane).
+    """Return terrain type -> sizes in its unit, in ascending order. The types are those in the comma-separated list `asked`,
+    by default those of the training (none on a plane).
 
-    A type of the list may name its sizes: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Other types have the sizes of `sizes_of` on
-    ground of that `scale`.
+    Sizes may follow a type in the list: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Other types have the sizes of `sizes_of`.
 
     Raises:
         ConfigError: a type is unknown or comes twice, a size is out of bounds, or the policy cannot see terrain.
@@ -150,12 +149,12 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
     entries = [[part.strip() for part in entry.partition("=")] for entry in asked.split(",")]
     terrain_types("--types", ",".join(name for name, _, _ in entries))
     if cfg.terrain.mesh_type == "plane" and "heights" in cfg.observations.groups["actor"].terms:
-        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane: to its policy 'heights' means nothing")
+        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane, so its policy cannot use 'heights'")
     return {name: _named_sizes(name, text) if given else sizes_of(name, full, scale) for name, given, text in entries}
 
 
 def _named_sizes(name: str, text: str) -> tuple[float, ...]:
-    """Return the named sizes of a type, '0.25' or '0.1:0.2:0.05', in its unit."""
+    """Return the sizes in the `text` '0.25' or '0.1:0.2:0.05', in the unit of the terrain type `name`."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
     given = low, high, _ = read_range(flag, text, f"{name}=0.1:0.2:0.05")
     if not SMALLEST <= low <= high <= kind.largest:
@@ -164,7 +163,7 @@ def _named_sizes(name: str, text: str) -> tuple[float, ...]:
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:
-    """Return type -> its size in the hardest row of the training, in its unit; empty for a plane."""
+    """Return terrain type -> its size in the training's hardest row, in the type's unit; an empty mapping for a plane."""
     terrain = cfg.terrain
     if terrain.mesh_type == "plane":
         return {}
@@ -173,7 +172,7 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
 
 
 def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
-    """Return overrides for a task of robots that walk out of tiles along their initial heading."""
+    """Return overrides for a task in which robots walk out of tiles along their initial heading."""
     return [
         *undisturbed(num_envs, TIME_S),
         *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
@@ -185,7 +184,7 @@ def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
 
 
 def place(task: LeggedRobot, robots: int) -> None:
-    """Put the first `robots` robots on the tiles of the first size, the next on those of the second, ..."""
+    """Put the first `robots` robots on the tiles of the first size, the next `robots` on those of the second, and so on."""
     assert task.terrain is not None
     assert task.terrain_curriculum is not None
     variants = (task.terrain.origins.shape[1] + 1) // 2
@@ -194,8 +193,8 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
-    """Run one type on a task with `robots` robots for each size on `tiles_of_sizes`; return its points, and how often a robot
-    lost contacts in a control step because memory was full.
+    """Measure one terrain type in a task that stands on `tiles_of_sizes`, with `robots` robots for each size. Return a point
+    for each size, and how often a robot lost contacts in a control step because memory was full.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -236,7 +235,7 @@ def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
 
 
 def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
-    """Return the share of successful robots (n,) with its interval, and the number of those that fell."""
+    """Return the share of the robots (n,) that were `successful`, with its interval, and the number of robots that `fell`."""
     trials, successes = len(successful), int(successful.sum())
     low, high = wilson(successes, trials)
     share = successes / trials
@@ -244,8 +243,10 @@ def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
 
 
 def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float]], robots: int) -> dict[str, Any]:
-    """Measure all `sizes` of each type with `robots` robots each, and print a line a type. Return plain numbers and lists."""
-    cfg = setting.cfg  # another scale asks for other lengths
+    """Measure all `sizes` of each terrain type with `robots` robots for each size, and print a line for each type. Return the
+    part `success` of a result.
+    """
+    cfg = setting.cfg  # overrides may change terrain.scale, and with it all lengths
     trained, scale = trained_to(setting.policy.cfg), cfg.terrain.scale  # type: ignore[arg-type]
     found: dict[str, Any] = {}
     lost = 0
@@ -276,10 +277,10 @@ def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float
 def _on_type(
     setting: Setting, name: str, sizes: Sequence[float], robots: int, changes: Sequence[tuple[str, Any]]
 ) -> tuple[list[dict[str, Any]], int]:
-    """Build the task for one type and measure; after the call nothing refers to the task."""
+    """Build the task for one terrain type and measure success; after the call nothing refers to the task."""
     cfg: Any = override(setting.policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
-    gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
+    gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not hold two
     task, act = restore(setting.policy, changes, setting.device, setting.graph, terrain)
     return measure_success(task, act, sizes, robots)
 
@@ -309,22 +310,22 @@ def print_success(success: dict[str, Any]) -> None:
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Return whether a size is harder than the hardest of training; False if the type was not trained on."""
+    """Return whether a size is harder than the hardest of the training; False if the training lacks the terrain type."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
-    grows = kind.size(1.0) >= kind.size(0.0)  # stepping stones get smaller
+    grows = kind.size(1.0) >= kind.size(0.0)  # false for stepping stones, which get smaller
     return size > trained_to + 1e-9 if grows else size < trained_to - 1e-9
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result`, and the results of other engines next to `path` (evaluation_<physics>.json) that are of the same
-    checkpoint and were measured with the same fields changed.
+    """Return `result` and the results of other engines whose files lie next to `path` (evaluation_<physics>.json). Only
+    results of the same checkpoint and with the same changed fields are returned.
     """
     found = [result]
     drawn = {"types": {ANY: {**TYPE, "points": [{**POINT, "low": NUMBER, "high": NUMBER}]}}, "robots_per_point": NUMBER}
     for engine in ENGINES.keys() - {result["physics"]}:
-        with suppress(OSError, ValueError):  # no file of this package: nothing to show
+        with suppress(OSError, ValueError):  # a file that is absent or damaged is left out
             saved = json.loads(path.with_name(file_name(engine)).read_text(encoding="utf-8"))
             check_form(saved, {**HEAD, "success": drawn}, str(path))
             same = {**{key: result.get(key) for key in ("task", "checkpoint", "changes")}, "physics": engine}
@@ -356,12 +357,12 @@ def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
 
 
 def types_in(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> its measurements; an empty mapping for an evaluation without success."""
+    """Return terrain type -> its measurements; an empty mapping if success on terrain was not measured."""
     return value_at(result, "success.types") or {}
 
 
 def success_line(label: str, entry: dict[str, Any]) -> Line:
-    """Return success over size of one terrain type, with its intervals where the file has them."""
+    """Return the line of success over size for one terrain type; its band shows the intervals, if the file has them."""
     points = sorted(entry["points"], key=lambda point: point["size"])
     banded = all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high"))
     keys = ("size", "share", "low", "high") if banded else ("size", "share")
@@ -370,8 +371,8 @@ def success_line(label: str, entry: dict[str, Any]) -> Line:
 
 
 def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
-    """Return the chart of success over the size of a terrain type, from entries of results and their lines. A dotted line
-    marks the hardest size of training; it names its runs where they differ in it.
+    """Return the chart of success over the size of a terrain type, from pairs of an entry of a result and its line. A dotted
+    line marks the hardest size of the training. If runs differ in it, each has its dotted line, which is named after the run.
     """
     ends: dict[float, list[str]] = {}
     for entry, line in lines:
@@ -385,7 +386,7 @@ def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> C
 
 
 def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return title -> types of a panel, for the types in `names`."""
+    """Return title of a panel -> its terrain types, for the types in `names`."""
     there = dict.fromkeys(names)
     shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
     alone = [name for name in there if name not in chain.from_iterable(PANELS.values())]

@@ -1,4 +1,4 @@
-"""Tiles of terrain for measurements, in place of those of the training."""
+"""Terrain tiles for measurements, which replace those of the training."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -12,20 +12,21 @@ from legged.evaluation.velocity_grid import Grid
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 
 BORDER = 3.0
-"""Level ground around the outer tiles [m]."""
+"""Width of the level ground around the outer tiles [m]."""
 ROUGH_SPAWN = 2.0
-"""Robots on rough ground start at most this far from the middle, in x and in y, so that they meet different bumps [m]."""
+"""Largest distance of a robot's start from the middle of rough ground, in x and in y, so that bumps differ [m]."""
 ROUGH_ROOM = 1.5
 """Margin of rough ground beyond the farthest point of a command [m]."""
 VARIANTS = 16
-"""Different tiles of each size of random types. Robots are distributed over them, because one tile may have an easy way out.
+"""Number of different tiles of each size, for random types. Robots are distributed over them, because a single tile may have
+an easy way out.
 """
 
 
 def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple[str, Any]]:
     """Return overrides for a task on tiles with sides of `side` [m]; the policy's observations stay as trained.
 
-    The caller builds the tiles. The configuration keeps one level tile, so that its ground does not count as too large.
+    The caller builds the tiles. The configuration describes a single level tile, which passes the check of the ground's size.
     """
     return [
         ("terrain.mesh_type", "height_map"),
@@ -47,7 +48,7 @@ def dividing_cell(length: float, cell: float) -> float:
 
 
 def cell_for(name: str, cfg: TerrainConfig) -> float:
-    """Return the edge of a type's cells [m]: that of the training, or a smaller one that divides the type's features."""
+    """Return the edge of a terrain type's height-map cells [m]: the training's, or less to divide the type's features."""
     kind = TERRAIN_TYPES[name]
     if not kind.exact or kind.finest is None:
         return cfg.horizontal_scale
@@ -55,24 +56,24 @@ def cell_for(name: str, cfg: TerrainConfig) -> float:
 
 
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build one level tile with bumps for all robots of a grid; the configuration holds its size (see `rough_side`)."""
+    """Build one level tile with bumps for all robots of a grid. The tile's size is that in `cfg` (see `rough_side`)."""
     return Terrain.of_tiles([[TileSpec("rough_slope_up", 0.0)]], cfg, np.random.default_rng(seed))
 
 
 def rough_side(grid: Grid) -> float:
-    """Return the side of a tile that no robot leaves while it holds its command [m]: 20 m for 1.4 m/s and 4 s."""
+    """Return a side that keeps all robots on the tile while they follow their commands [m]: 20 m for 1.4 m/s and 4 s."""
     fastest = float(np.linalg.norm(grid.cells[:, :2], axis=1).max())
     return 2.0 * ceil(ROUGH_SPAWN + fastest * grid.hold_s + ROUGH_ROOM)
 
 
 def tiles_of_sizes(name: str, sizes: Sequence[float], cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build the tiles of every size of a type: see `tiles_apart`."""
+    """Build tiles of one type, in all its sizes, as `tiles_apart` arranges them."""
     return tiles_apart([TileSpec(name, size) for size in sizes], cfg, seed)
 
 
 def tiles_apart(specs: Sequence[TileSpec], cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build tiles of every kind: kind i in row 2 i, variant k in column 2 k. Level ground lies between them, so that robots
-    leave their own tile before they reach another kind.
+    """Build tiles of all `specs`: variant k of spec i lies in row 2 i and column 2 k. Level ground separates the tiles, so
+    that a robot has left its own tile before it reaches another.
     """
     variants = 1 if all(TERRAIN_TYPES[spec.type].regular for spec in specs) else VARIANTS
     rows = [[TileSpec("flat", 0.0)] * (2 * variants - 1) for _ in range(2 * len(specs) - 1)]

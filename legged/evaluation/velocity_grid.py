@@ -15,26 +15,26 @@ from legged.errors import ConfigError
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
 """Commands and their units."""
 AXIS = "-1:1:0.5"
-"""Default commands of an axis."""
+"""Default range of an axis, low:high:step."""
 MOST_ROBOTS = 2**20
-"""Most robots at once."""
+"""Largest number of robots that are simulated at once."""
 MOST_VALUES = 10_000
-"""Most commands on an axis."""
+"""Largest number of commands on an axis."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Commands (vx, vy [m/s], yaw rate [rad/s]): all combinations, each held by some robots for some time."""
+    """Commands vx, vy [m/s] and yaw rate [rad/s]: each combination of their values is a cell, which `robots` robots hold."""
 
     vx: Sequence[float]
     vy: Sequence[float]
     yaw: Sequence[float]
     robots: int = 16
-    """Robots a cell."""
+    """Number of robots in each cell."""
     hold_s: float = 4.0
     """Time for which a command is held [s]."""
     settle_s: float = 1.0
-    """Time at the start of a command that is not measured [s]."""
+    """Time at the start of a command in which errors are not measured [s]."""
 
     @property
     def cells(self) -> np.ndarray:
@@ -53,7 +53,7 @@ class Grid:
 
     @property
     def axes(self) -> dict[str, list[float]]:
-        """Return the values of each axis, by its name."""
+        """Return name of an axis -> its values."""
         return {name: list(getattr(self, name)) for name in AXES}
 
     @property
@@ -63,7 +63,7 @@ class Grid:
 
 
 def axis_values(flag: str, text: str) -> list[float]:
-    """Read an axis: '-1:1:0.5' -> [-1, -0.5, 0, 0.5, 1]; a single number is a single value.
+    """Read the values of an axis: '-1:1:0.5' gives [-1, -0.5, 0, 0.5, 1], and a single number gives one value.
 
     Raises:
         ConfigError: the text has another form.
@@ -75,7 +75,7 @@ def axis_values(flag: str, text: str) -> list[float]:
 
 
 def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]:
-    """Read 'low:high:step', or a single number, which is both ends.
+    """Read (low, high, step) from 'low:high:step', or from a single number, which is both low and high.
 
     Raises:
         ConfigError: the text has another form.
@@ -92,7 +92,7 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
 
 
 def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
-    """Return the values of each axis, by its name, of the grid in a task's configuration.
+    """Return name of an axis -> its values, for the grid in a task's configuration.
 
     Raises:
         ConfigError: an axis is not a range, or has too many values.
@@ -105,7 +105,7 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
 def spaced(
     where: str, text: str, given: Sequence[float], what: str = "cells of this axis alone", most: int = MOST_VALUES
 ) -> list[float]:
-    """Return the values of a range, `given` as (low, high, step); `where`, `text` and `what` are words for errors.
+    """Return the values of the range `given` (low, high, step). `where`, `text` and `what` are used in error messages.
 
     Raises:
         ConfigError: the range has more than `most` values.
@@ -134,7 +134,7 @@ def check_size(grid: Grid) -> None:
 
 
 def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
-    """Return mean and worst of `values` (C,) over the `cells` (C, 3) whose value is not NaN; null if all are."""
+    """Return mean, worst value and worst cell of `values` (C,) over the `cells` (C, 3), without NaN; null if all are NaN."""
     if np.isnan(values).all():
         return {"mean": None, "worst": None, "worst_cell": None}
     worst = int(np.nanargmax(values))
@@ -142,5 +142,5 @@ def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
 
 
 def number_or_null(value: float) -> float | None:
-    """Return a float for JSON; null for a value that is not finite."""
+    """Return a value for a JSON file: null (None) if it is not finite."""
     return float(value) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Errors of a policy that follows velocity commands, over a grid of constant ones: measured, printed and drawn."""
+"""Velocity tracking: errors of a policy over a grid of constant commands, measured, printed and drawn."""
 
 import math
 import warnings
@@ -30,16 +30,16 @@ from legged.terrain import Terrain
 
 GRAVITY = 9.81
 SLOWEST = 0.1
-"""Cost of transport is not defined for robots slower than this [m/s]."""
+"""Speed below which a robot has no cost of transport [m/s]."""
 GAIT = (
     ("duty factor", "duty_factor", 1.0, "{:.2f}"),
     ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
     ("base height", "base_height", 1.0, "{:.3f} m"),
     ("thigh or shank contact", "thigh_contact", 100.0, "{:.2f} % of steps"),
 )
-"""Label, name in a cell, factor, format; null where every robot fell before it was measured."""
+"""Figures of the gait: label, name in a cell, factor and format."""
 PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
-"""Heat maps: figure of a cell, axis over which its mean is taken, axis that goes up, title."""
+"""Heat maps: figure of a cell, index of the command over which its mean is taken, command on the vertical axis, title."""
 
 
 def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
@@ -55,8 +55,8 @@ def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
 def place_to_track(
     cfg: LeggedConfig, grid: Grid, asked: list[tuple[str, Any]]
 ) -> tuple[list[tuple[str, Any]], Terrain | None]:
-    """Return overrides, with `asked`, for a task of grid.num_envs undisturbed robots, and its bumpy level ground; None for
-    the plane of a task without terrain.
+    """Return the overrides for a task of grid.num_envs undisturbed robots, followed by `asked`, and the ground. The ground is
+    level with bumps; it is None for a task on a plane.
     """
     changes = undisturbed(grid.num_envs, grid.hold_s)
     if cfg.terrain.mesh_type == "plane":
@@ -68,13 +68,13 @@ def place_to_track(
 
 @torch.inference_mode()
 def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, Any]:
-    """Run the grid on a task of grid.num_envs robots; return plain numbers and lists, with one entry for each cell in
-    "cells".
+    """Run the grid on a task of grid.num_envs robots. Return the figures as numbers and lists for a JSON file; "cells" has an
+    entry for each cell.
 
     A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
-    power of the cost of transport is that of the last physics step of each control step, which is lower than the mean over
-    all physics steps. `contact_overflows` counts robots times steps that lost contacts because memory was full; `estimates`
-    holds the errors of a policy with an estimator.
+    cost of transport uses the power in the last physics step of each control step, which is lower than the mean over all
+    physics steps. `contact_overflows` is the number of pairs of a robot and a step in which contacts were lost because memory
+    was full. `estimates` holds the errors of a policy with an estimator.
     """
     network = getattr(act, "network", None)
     estimated = EstimationErrors(task.observation_groups[ESTIMATED]) if isinstance(network, EstimatingModel) else None
@@ -104,9 +104,9 @@ def hold(
     hold_s: float,
     read: Callable[[TensorDict], dict[str, Tensor]],
 ) -> tuple[dict[str, Tensor], Tensor, int]:
-    """Let robots follow constant commands (N, 3) for `hold_s` [s], and read quantities (N, ...) from the observations and the
-    task after each step that follows the first `settle_s`. Return their sums over the steps of each robot's first episode,
-    with the number of these `steps` (N,); the flags (N,) of the robots that fell in it; and how often a robot lost contacts.
+    """Let robots follow constant commands (N, 3) for `hold_s` [s]. After the first `settle_s` [s], `read` returns quantities
+    (N, ...) at each step, given the observations. Return the sums of these quantities over each robot's first episode, with
+    the number of summed `steps` (N,); the flags (N,) of robots that fell in it; and how often a robot lost contacts.
     """
     task.reset()
     observations = task.hold_commands(commands)
@@ -143,14 +143,14 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
 
 
 def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tensor, measured_s: float) -> dict[str, Any]:
-    """Return the figures cell by cell, and over the grid; null where no robot was left to be measured."""
+    """Return the figures of each cell and of the whole grid; null if no robot stood long enough to be measured."""
     cells = grid.cells
 
     def per_cell(values: Tensor) -> np.ndarray:
         return values.double().cpu().numpy().reshape(len(cells), grid.robots, *values.shape[1:])
 
     total = {name: per_cell(values).sum(axis=1) for name, values in sums.items()}
-    # A cell in which every robot fell before it was measured has neither errors nor a gait; 0 would look perfect.
+    # If every robot of a cell fell before it was measured, the errors and the gait are NaN, because 0 would look perfect.
     steps = np.where(total["steps"] > 0, total["steps"], np.nan)
     lin, ang = (np.sqrt(total[name] / steps) for name in ("lin", "ang"))
     speed = total["speed"] / steps
@@ -194,8 +194,8 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
 def estimation_errors(
     kind: type[BaseTask], names: Sequence[str], squares: Tensor, steps: Tensor
 ) -> dict[str, dict[str, Any]]:
-    """Return the root mean square error of each estimated term, with its unit, from the sums of squares (N, terms) over the
-    `steps` (N,) of each robot; null without a step.
+    """Return estimated term -> root mean square error over all robots and steps, and unit. `squares` (N, terms) are sums over
+    the `steps` (N,) of each robot. The error is null if there is no step.
     """
     count = float(steps.double().sum())
     means = (squares.double().sum(dim=0) / max(count, 1.0)).tolist()
@@ -235,8 +235,8 @@ def _command(cell: list[float]) -> str:
 
 
 def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
-    """Return the mean of a figure over axis `over` of the command grid, (values of vx, values of the other command); NaN for
-    cells in which every robot fell early.
+    """Return the mean of a figure over the command with index `over`, as (values of vx, values of the remaining command). It
+    is NaN where every robot fell before it was measured.
     """
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
@@ -246,7 +246,7 @@ def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
 
 
 def draw_tracking(result: dict[str, Any], path: Path) -> None:
-    """Draw heat maps: for each (vx, vy) and each (vx, yaw), the mean over the third command."""
+    """Draw heat maps of the errors over (vx, vy) and over (vx, yaw rate), as means over the third command."""
     grid = result["grid"]
     with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
         for axis, (name, over, other, label) in zip(axes[0], PANELS, strict=True):

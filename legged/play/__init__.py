@@ -1,1 +1,1 @@
-"""Demonstration of a policy: its ground, its walk, films, the window, and the page in a browser (live/)."""
+"""Demonstrations of a policy: the ground, the commands, films, MuJoCo's window, and a page in a browser (live/)."""

@@ -1,5 +1,5 @@
-"""Demonstrations for the film and the tables of `play`: robots follow a schedule of commands, walk out of their tiles of
-terrain, or, in tasks without commands, go through an episode.
+"""Demonstrations for the film and the tables of `play`: robots follow a schedule of commands or walk out of their terrain
+tiles. In tasks without commands they go through an episode.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from legged.play.playground import Playground
 from legged.policies.episodes import Policy, episodes_table, measure_episodes
 from legged.tables import screen_table
 
-SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
+SCHEDULE = (  # (seconds, (vx, vy [m/s], yaw rate [rad/s]))
     (2.0, (0.5, 0.0, 0.0)),
     (2.5, (1.0, 0.0, 0.0)),
     (2.0, (0.0, 0.5, 0.0)),
@@ -22,27 +22,29 @@ SCHEDULE = (  # seconds; vx, vy [m/s], yaw rate [rad/s]
     (1.5, (0.0, 0.0, -0.8)),
     (1.5, (0.0, 0.0, 0.0)),
 )
-"""Commands in the video, clipped to the ranges of the training."""
+"""Times and commands of the demonstration; commands are clipped to the ranges of the training."""
 SETTLE_S = 1.0
-"""Time after the start of a command and after a fall that is not measured [s]."""
+"""Time after the start of a command, and after a fall, in which errors are not measured [s]."""
 FORWARD = 0.7
 """Commanded forward velocity [m/s], clipped to the range of the training."""
 EPISODE_S = 12.0
-"""Time in which robots walk out of their tile and into the next one, before all start again [s]."""
+"""Time in which robots walk out of their tile and into the next one; then all robots start again [s]."""
 EPISODES = 2
 FILM_S = 20.0
-"""Filmed part of an episode [s]."""
+"""Length of the filmed part of an episode [s]."""
 
 
 class TrackingErrors:
-    """Sums of squared velocity errors and of falls of N robots."""
+    """Sums of the squared velocity errors, and numbers of falls, of N robots."""
 
     COLUMNS = ("velocity RMSE", "yaw rate RMSE", "falls")
-    """Columns of a `row`."""
+    """Headings of the columns of `row`."""
 
     def __init__(self, task: LeggedRobot) -> None:
         self.steps, self.lin, self.ang, self.falls = torch.zeros(4, task.num_envs, device=task.device)
-        """(N,) each: measured control steps, summed squared errors of vx and vy [m^2/s^2] and yaw rate [rad^2/s^2], falls."""
+        """(N,) each: number of measured control steps, sums of squared errors of (vx, vy) [m^2/s^2] and of the yaw rate
+        [rad^2/s^2], and number of falls.
+        """
 
     def add(self, task: LeggedRobot, measured: Tensor) -> None:
         """Add the falls of the last step, and the errors of the robots in the mask `measured` (N,)."""
@@ -60,7 +62,7 @@ class TrackingErrors:
 
 
 def velocities(task: LeggedRobot, robots: slice) -> list[str]:
-    """Return lines with the commanded velocity of the first of `robots` and the mean actual velocity of all of them."""
+    """Return two lines of text: the commanded velocity of the first of `robots`, and the mean actual velocity of `robots`."""
     wanted = task.commands[robots][0, :3].tolist()
     actual = [*task.base_lin_vel[robots, :2].mean(dim=0).tolist(), float(task.base_ang_vel[robots, 2].mean())]
     text = "{}  {:+.2f}  {:+.2f} m/s  {:+.2f} rad/s"
@@ -69,7 +71,7 @@ def velocities(task: LeggedRobot, robots: slice) -> list[str]:
 
 @torch.inference_mode()
 def follow_schedule(task: LeggedRobot, act: Policy, video: Video) -> Table:
-    """Run the schedule on all robots, filmed by `video`; return a table of errors and falls."""
+    """Let all robots follow the schedule, record `video`, and return a table of errors and falls."""
     rows = []
     low, high = task.command_sampler.full_ranges.cpu().numpy().T
     task.reset()
@@ -89,7 +91,7 @@ def follow_schedule(task: LeggedRobot, act: Policy, video: Video) -> Table:
 
 @torch.inference_mode()
 def walk_out(task: LeggedRobot, act: Policy, playground: Playground, video: Video) -> Table:
-    """Walk the robots along x from the middle of their tiles, filmed by `video`; return a table of errors and falls by
+    """Let the robots walk along x from the middle of their tiles, record `video`, and return a table of errors and falls by
     terrain type.
     """
     assert task.terrain is not None, "the task stands on a plane"
@@ -104,7 +106,7 @@ def walk_out(task: LeggedRobot, act: Policy, playground: Playground, video: Vide
         followed = episode % task.num_envs
         for step in range(max(1, round(EPISODE_S / task.dt))):
             observations, _, _, _ = task.step(act(observations))
-            errors.add(task, task.episode_length_buf * task.dt >= SETTLE_S)  # robots that were reset are left out
+            errors.add(task, task.episode_length_buf * task.dt >= SETTLE_S)  # robots are left out for SETTLE_S after a reset
             if video.due(step):
                 where = playground.label(task.terrain, task.base_pos[followed].tolist())
                 video.take(*velocities(task, slice(followed, followed + 1)), where, followed=followed)
@@ -119,7 +121,7 @@ def walk_out(task: LeggedRobot, act: Policy, playground: Playground, video: Vide
 
 
 def roll_out(task: BaseTask, act: Policy, video: Video) -> Table:
-    """Run every environment through an episode, the first one filmed by `video`; return a table of returns and lengths."""
+    """Run an episode in every environment, record `video` in the first, and return a table of returns and lengths."""
 
     def film(step: int, so_far: float) -> None:
         if video.due(step) and step * task.dt < FILM_S:

@@ -1,4 +1,4 @@
-"""Films as MP4, GIF or PNG: of a play, with text in its frames, and of a policy that walks straight ahead."""
+"""Films as MP4, GIF or PNG: of `play`, with text in the frames, and of a robot that walks straight ahead."""
 
 import errno
 import subprocess
@@ -20,32 +20,33 @@ from legged.process.paths import DISK_FULL, make_folder, relative, replacing
 from legged.rendering.camera import RobotsCamera, camera_of
 
 Film = list[np.ndarray]
-"""Pictures, each (height, width, 3) uint8."""
+"""Pictures of a film, each (height, width, 3) uint8."""
 PLAY_FPS = 25
-"""Frames per second of a play; fewer if control steps are longer."""
+"""Frames per second of a film of `play`; the film has fewer if control steps are longer than a frame."""
 GIF_FPS, GIF_S, GIF_SIZE = 8, 12.0, (416, 234)
-"""Frames per second, length [s], and width and height [pixels] of the GIF of a play."""
+"""Frames per second, length [s], and width and height [pixels] of a GIF of `play`."""
 FPS = 12.5
-"""Pictures per second of a walk; the duration of one, in hundredths of a second, must be whole in a GIF."""
+"""Pictures per second of a walk. In a GIF each picture lasts a whole number of hundredths of a second, here 8."""
 FILM_S, WARM_UP_S = 4.0, 2.0
-"""Length of the film of a walk, and of the walk before it [s]."""
+"""Length of the film of a walk, and time for which the robot walks before the film begins [s]."""
 SPEED = 0.6
 """Commanded forward velocity of a walk as a share of the largest trained one."""
 FILL, GLIDE = 0.82, 0.5
-"""Share of a picture that the robot fills in its default pose; share of the gap that the camera closes per picture."""
+"""Share of the picture's size that the robot fills in its default pose; share of its distance to the robot by which the
+camera moves in each picture."""
 SHARP = 2
-"""Pictures of a walk are rendered this many times larger, and scaled down to smooth edges."""
+"""Factor by which pictures of a walk are rendered larger; scaling them down smooths edges."""
 MOST_BYTES = 2_000_000
-"""Size limit of a GIF."""
+"""Size limit of the GIF of a walk [bytes]."""
 SMALLER: tuple[tuple[int, float], ...] = (
     *((96, 1.0), (64, 1.0), (48, 1.0), (48, 0.92), (48, 0.84), (48, 0.76)),
     *((40, 0.7), (40, 0.6), (32, 0.5), (24, 0.4), (16, 0.3)),
 )
-"""Colours and scale of a GIF, tried in this order until it is small enough."""
+"""Number of colours and scale of a GIF; the pairs are tried in this order until the GIF is small enough."""
 
 
 class Video:
-    """Recorder of pictures of a task's first robots; without a folder it does nothing."""
+    """Recorder of a film of a task's first robots; without a folder it records nothing."""
 
     def __init__(self, task: BaseTask, count: int, folder: Path | None, gif: bool = False) -> None:
         """Create the camera and the folder.
@@ -62,9 +63,9 @@ class Video:
                 raise RunError(f"{error}, or play with --no-video") from error
             make_folder(folder)
         self.every = max(1, round(1.0 / (PLAY_FPS * task.dt)))
-        """Control steps from one frame to the next."""
+        """Number of control steps from one frame to the next."""
         self.fps = 1.0 / (self.every * task.dt)
-        """Frames a second of the film, which shows real time."""
+        """Frames per second with which the film runs in real time."""
         self.frames: Film = []
         self._start = time.perf_counter()
 
@@ -73,7 +74,7 @@ class Video:
         return self.camera is not None and step % self.every == 0
 
     def take(self, *lines: str, followed: int = 0) -> None:
-        """Record a frame with lines of text; over terrain the camera follows the robot number `followed`."""
+        """Record a frame with `lines` of text. On terrain the camera follows the robot with index `followed`."""
         self.camera.followed = followed
         self.frames.append(self.camera.picture(lines))
 
@@ -86,7 +87,7 @@ class Video:
         if self.camera is None or self.folder is None:
             return
         self.camera.close()
-        if self.gif:  # written first, because it needs no encoder
+        if self.gif:  # the GIF is written first, because it needs no encoder that may fail
             every = max(1, round(self.fps / GIF_FPS))
             shown = [resized(frame, *GIF_SIZE) for frame in self.frames[: max(1, round(GIF_S * self.fps)) : every]]
             write_film(shown, self.folder / "play.gif", self.fps / every)
@@ -96,19 +97,19 @@ class Video:
 
 
 def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
-    """Return the configuration of a policy that follows velocity commands; `where` is the beginning of an error.
+    """Return the configuration of a policy that follows velocity commands. Error messages begin with `where`.
 
     Raises:
         ConfigError: the policy follows no commands.
     """
     if not isinstance(policy.cfg, LeggedConfig):
-        raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands: there is no way to ask it to walk")
+        raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands, so it cannot be told to walk")
     return policy.cfg
 
 
 def film(policy: TrainedPolicy, side: int) -> Film:
-    """Let a robot walk straight ahead in C MuJoCo on the CPU, on a plane or on tiles of its most frequent terrain type of
-    training. Return pictures of `side` x `side` pixels.
+    """Let a robot walk straight ahead in C MuJoCo on the CPU, and return pictures of `side` x `side` pixels. The robot walks
+    on a plane or, if it was trained on terrain, on tiles of the most frequent terrain type of the training.
 
     Raises:
         ConfigError: the policy follows no commands, or does not fit its task.
@@ -164,7 +165,7 @@ def write_mp4(frames: Film, path: Path, fps: float) -> None:
         RunError: the film cannot be written.
     """
     try:
-        import imageio_ffmpeg  # only films need imageio
+        import imageio_ffmpeg  # imported here, because only films need it
 
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
@@ -185,7 +186,7 @@ def write_mp4(frames: Film, path: Path, fps: float) -> None:
 
 
 def write_film(pictures: Film, path: Path, fps: float = FPS) -> str:
-    """Write a GIF of at most MOST_BYTES, or the film's middle picture if the name ends with .png; return a line on the file.
+    """Write a GIF of at most MOST_BYTES, or the middle picture if the file's name ends with .png. Return a line to print.
 
     Raises:
         RunError: the file can't be written, or the GIF is too large at the smallest scale.
@@ -207,12 +208,12 @@ def write_film(pictures: Film, path: Path, fps: float = FPS) -> str:
             shown = f"{len(pictures)} pictures of {width} x {height} pixels, {colors} colours"
             return f"written: {relative(path)}, {size / 1e6:.2f} MB, {shown}"
     path.unlink(missing_ok=True)
-    raise RunError(f"{relative(path)}: would be larger than {MOST_BYTES / 1e6:g} MB; make its pictures smaller")
+    raise RunError(f"{relative(path)}: the GIF would be larger than {MOST_BYTES / 1e6:g} MB; make its pictures smaller")
 
 
 def _palette(pixels: np.ndarray, colors: int) -> Image.Image:
-    """Return a palette for pixels (..., 3) uint8. The weight of a colour is the square root of its frequency, so that the
-    floor does not take all colours.
+    """Return a palette of `colors` colours for pixels (..., 3) uint8. Colours are weighted by the square root of their
+    frequency, so that not all entries of the palette are colours of the floor.
     """
     fine = (pixels.reshape(-1, 3) >> 2).astype(np.int64)
     found, counts = np.unique(fine @ np.array([1 << 12, 1 << 6, 1]), return_counts=True)

@@ -1,4 +1,4 @@
-"""The ground of `play`: a few tiles of chosen types and sizes, with a place for every robot."""
+"""The ground of `play`: a few terrain tiles of chosen types and sizes, to which robots are assigned."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,17 +13,19 @@ from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type, tile_size
 
 DIFFICULTIES = (0.5, 0.8)
-"""Difficulties of the tiles on which robots start, and of the next tiles."""
+"""Default difficulties of the tiles on which robots start, and of the tiles behind them."""
 COLUMNS = 4
-"""Tiles side by side of a single type; tiles of random types differ."""
+"""Number of tiles side by side if a single type is chosen; tiles of random types differ from each other."""
 SETTING: tuple[tuple[str, Any], ...] = (
     ("terrain.border_size", 3.0),
     ("terrain.spawn_range", 0.3),
     ("init_state.yaw", [0.0, 0.0]),
 )
-"""Overrides: a narrow border, starts near the middle of tiles, facing along x; later overrides may replace them."""
+"""Overrides for a narrow border and for robots that start near the middle of a tile and face along x. Overrides of the user
+come later and replace these.
+"""
 ROWS_NEEDED = 128
-"""Constraint rows that a robot on steps needs in mujoco-warp."""
+"""Number of constraint rows that a robot on steps needs in mujoco-warp."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,12 @@ class Playground:
 
     rows: tuple[tuple[TileSpec, ...], tuple[TileSpec, ...]]
     order: tuple[int, ...]
-    """Columns in the order in which robots are placed, the most important first."""
+    """Indices of the columns in the order in which robots are placed on them."""
 
     @classmethod
     def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
-        """Return the playground of --terrain and --difficulty: COLUMNS tiles of the type `name`, or else one of each type of
-        the task; None for a task on a plane.
+        """Return the playground for --terrain (`name`) and --difficulty: COLUMNS columns of the type `name` or, with no name,
+        a column for each type of the task. Return None without a name for a task on a plane.
 
         Raises:
             ConfigError: the type or the difficulty does not exist.
@@ -61,7 +63,7 @@ class Playground:
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
 
         def size(kind: str, usual: float) -> float:
-            """Return the size of a tile; without a given difficulty it is the training's, if that is fixed."""
+            """Return the size of a tile at the given difficulty, or at the `usual` one in the training's terrain."""
             if difficulty is None:
                 return tile_size(cfg.terrain, kind, usual)
             return TERRAIN_TYPES[kind].sized(difficulty, cfg.terrain.scale)
@@ -70,7 +72,7 @@ class Playground:
         return cls((front, back), tuple(order))
 
     def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
-        """Return overrides that put a task of configuration `cfg` on this ground, with unchanged observations."""
+        """Return overrides that put a task with the configuration `cfg` on this ground; observations stay as trained."""
         kinds = {spec.type for spec in self.rows[0]}
         shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | {spec.type: 1.0 / len(kinds) for spec in self.rows[0]}
         return [
@@ -85,7 +87,7 @@ class Playground:
         ]
 
     def build(self, cfg: LeggedConfig) -> Terrain:
-        """Return the terrain with the tile size of `cfg`, which includes the changes above.
+        """Return the terrain with the tile size of `cfg`, a configuration with the overrides of `changes`.
 
         Raises:
             ConfigError: the tiles are too small.
@@ -94,7 +96,7 @@ class Playground:
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:
-        """Return the column of each robot; `shift` moves all robots on in `order`."""
+        """Return the column of each robot. All robots are moved on by `shift` places in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
     def place(self, task: LeggedRobot, shift: int = 0) -> None:
@@ -110,14 +112,14 @@ class Playground:
         return label(self.rows[row][column].type, [self.rows[row][column].size])
 
     def labels(self) -> dict[str, str]:
-        """Return type -> its name with all its sizes."""
-        sizes: dict[str, dict[float, None]] = {}  # in order, each once
+        """Return terrain type -> the text of `label` with the sizes of its tiles."""
+        sizes: dict[str, dict[float, None]] = {}  # an ordered set of sizes for each type
         for spec in (*self.rows[0], *self.rows[1]):
             sizes.setdefault(spec.type, {})[spec.size] = None
         return {kind: label(kind, list(own)) for kind, own in sizes.items()}
 
 
 def label(kind: str, sizes: Sequence[float]) -> str:
-    """Return the name of tiles of one type and some sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
+    """Return a text for tiles of one type with these sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
     info = TERRAIN_TYPES[kind]
     return kind if kind == "flat" else f"{kind}, {info.what} {info.text(*sizes)}"

@@ -1,4 +1,4 @@
-"""MuJoCo's viewer with keyboard commands."""
+"""MuJoCo's viewer, with commands from the keyboard."""
 
 import time
 
@@ -20,17 +20,17 @@ HELP_WITHOUT_COMMANDS = "viewer: backspace starts anew; close the window to reco
 
 
 class Keyboard:
-    """Key presses -> a command (vx, vy, yaw rate) within the ranges of the task."""
+    """A command vx, vy [m/s], yaw rate [rad/s] within the ranges of the task, which key presses change."""
 
     MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
 
     def __init__(self, low: list[float], high: list[float]) -> None:
-        """Start with the command zero; `low` and `high` are the limits of each axis."""
+        """Start with the command zero. `low` and `high` are the limits of vx, vy and yaw rate."""
         self.low, self.high = low, high
         self.command = [0.0, 0.0, 0.0]
         self.restart = False
         self.tile = 0
-        """Number of requests for the next tile."""
+        """Number of times that the next tile was requested."""
 
     def press(self, key: int) -> None:
         """Process a key by its GLFW code; other keys have no effect."""
@@ -47,8 +47,8 @@ class Keyboard:
 
 @torch.inference_mode()
 def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> None:
-    """Show the task's first environment in real time until the window is closed; on terrain, on a tile of the playground."""
-    import mujoco.viewer  # needs a library for windows, which a machine without a display may lack
+    """Show the task's first environment in real time until the window is closed, on the `playground` if one is given."""
+    import mujoco.viewer  # imported here, because a machine without a display may lack a library
 
     legged = task if isinstance(task, LeggedRobot) else None
     low, high = legged.command_sampler.full_ranges.t().tolist() if legged else ([0.0] * 3, [0.0] * 3)
@@ -66,7 +66,7 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
             window.cam.trackbodyid = model.body(f"0/{legged.robot.file.base}").id
             away, window.cam.azimuth, window.cam.elevation = (2.4, 130, -18) if legged.terrain is None else (3.83, 62, -35)
             window.cam.distance = away * size_of(legged.robot).max()
-            window.opt.geomgroup[3] = 0  # collision shapes
+            window.opt.geomgroup[3] = 0  # hide collision shapes
         while window.is_running():
             begin = time.perf_counter()
             if keyboard.restart:
@@ -83,7 +83,7 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
 
 
 def begin_anew(task: BaseTask, playground: Playground | None, keyboard: Keyboard) -> TensorDict:
-    """Reset the task, on terrain on the tile that the keyboard selects, and print its name; return the observations."""
+    """Reset the task and return the observations. On a playground, go to the tile chosen by key and print its name."""
     if playground and isinstance(task, LeggedRobot):
         playground.place(task, keyboard.tile)
     observations = task.reset()

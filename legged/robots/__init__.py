@@ -1,1 +1,1 @@
-"""Robots as data: a folder with robot.yaml and MJCF."""
+"""Robots as data: each is a folder with robot.yaml and an MJCF model."""

@@ -9,17 +9,18 @@ from legged.robots.stance import standing_height
 CROUCH = 0.55
 """Height of the base in the crouched pose, as a share of its height in the default pose."""
 FACTORS = np.arange(1.0, 4.0, 0.05)
-"""Factors on the default angles of the joints that swing legs, tried in this order."""
+"""Factors on the default angles of the joints that swing legs. They are tried in this order."""
 FEWEST_FEET = 4
-"""Least number of feet; with fewer a crouching robot may fall."""
+"""Least number of feet; with fewer feet a crouching robot may fall."""
 
 
 def crouch(robot: Robot) -> np.ndarray | None:
-    """Return joint angles (D,) [rad] at which a robot stands on its feet with its base at most `CROUCH` times its default
-    height above the ground.
+    """Return joint angles (D,) [rad] of a crouched pose, in which the base is at most `CROUCH` times as high as in the
+    default pose.
 
-    The angles are those of the default pose, with all joints that swing legs multiplied by one factor, within their limits.
-    Return None for a robot with fewer than four feet, with passive joints, or with legs that do not bend so far.
+    The angles are those of the default pose, except that the angles of joints that swing legs are multiplied by one factor
+    and clipped to their limits. Return None for a robot with fewer than four feet, with passive joints, or with legs that do
+    not bend so far.
     """
     if robot.passive is not None or len(robot.feet_indices) < FEWEST_FEET:
         return None

@@ -1,15 +1,15 @@
-"""Rule for the gains of a robot whose file states none: from the inertia that each joint sees, and the weight that it
-carries.
+"""Rule for the gains of a robot whose file states none. Gains follow from the inertia that each joint moves, and from the
+weight that the joint carries.
 
 Two inertias matter. With the robot in the air, a joint moves the links behind it against the rest of the robot. With the feet
 on the ground, the same joint moves the base as well.
 
-P gains come from the first inertia, at a natural frequency that is the same for all robots in units of their own time sqrt(h
-/ g). They are raised until no joint gives way under the robot's weight. D gains come from the geometric mean of both
-inertias, at one damping ratio. Both gains are limited so that an explicit control law is stable at steps of 5 ms.
+P gains give the first inertia a natural frequency that is the same for all robots, in units of sqrt(g / h). They are raised
+until no joint gives way under the robot's weight. D gains give the geometric mean of both inertias one damping ratio. Both
+gains are limited so that an explicit control law is stable at steps of 5 ms.
 
-For ANYmal C and Go2 the rule gives the makers' P gains within a factor of two, and D gains that are 0.7 to 2.4 and 1.9 to 3.7
-times the makers'.
+For ANYmal C and Go2 the rule gives the makers' P gains within a factor of two. Its D gains are 0.7 to 2.4 times the makers'
+for ANYmal C, and 1.9 to 3.7 times for Go2.
 """
 
 from collections.abc import Sequence
@@ -24,17 +24,16 @@ RATIO = 0.5
 SAG = 0.25
 """Largest deflection of a joint under the robot's weight [rad]."""
 SHIFT = 0.1
-"""Least P gain of a leg's joint, in units of m g h; with a smaller one, an ankle could not shift the robot's weight [1/rad].
-"""
+"""Least P gain of a leg's joint in units of m g h [1/rad]; with less, an ankle could not shift the robot's weight."""
 LARGEST_TARGET = 0.3
-"""Target offset at which a joint demands its motor's whole effort [rad]; smaller offsets demand less."""
+"""Least offset of a target at which the P gain demands the motor's whole torque [rad]."""
 TIME_STEP = 0.005
 """Physics step in which an explicit control law has to be stable [s]."""
 MARGIN = 1.0
 """Largest eigenvalue of TIME_STEP M^-1 D and of TIME_STEP^2 M^-1 K; from 2 on the explicit law diverges."""
 
 VELOCITY_LIMIT = 30.0
-"""Largest joint speed of a robot whose file states none, typical of geared motors of legged robots [rad/s]."""
+"""Largest joint speed of a robot whose file states none [rad/s]. It is typical of the geared motors of legged robots."""
 
 
 def gains(
@@ -57,7 +56,7 @@ def gains(
     leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
     least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
     stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
-    # By Gershgorin's circles no eigenvalue of TIME_STEP^2 M^-1 K is larger; light links, such as toes, get smaller gains.
+    # With these gains no eigenvalue of TIME_STEP^2 M^-1 K exceeds MARGIN (Gershgorin). Light links, such as toes, get less.
     stiffness = np.minimum(stiffness, MARGIN / (TIME_STEP**2 * np.abs(inverse[np.ix_(dofs, dofs)]).sum(axis=0)))
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
@@ -66,8 +65,8 @@ def gains(
 
 
 def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:
-    """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns with the robot in the air in the pose
-    `qpos` [kg m^2]. All other joints move freely.
+    """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns [kg m^2], with the robot in the air
+    in the pose `qpos` and all other joints moving freely.
     """
     dofs = model.jnt_dofadr[list(joints)]
     return np.asarray(1.0 / _inverse_inertia(model, qpos)[1][dofs, dofs])
@@ -75,7 +74,7 @@ def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int
 
 def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
     """Return the torques (D,) of the hinges `joints` (ids) that hold the robot at rest in the pose `qpos` [N m]. The shapes
-    `feet` (ids) carry the base with the smallest sufficient forces.
+    `feet` (ids) carry the base with the least forces, in the sum of squares.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -85,7 +84,7 @@ def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[i
 
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the joint-space inertia (V, V), for V degrees of freedom, of a state whose positions are computed."""
+    """Return the joint-space inertia (V, V) for V degrees of freedom; `data` has to hold MuJoCo's poses and inertias."""
     columns = np.zeros((model.nv, model.nv))
     for i, unit in enumerate(np.eye(model.nv)):
         mujoco.mj_mulM(model, data, columns[i], unit)
@@ -93,7 +92,7 @@ def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.MjData, np.ndarray]:
-    """Return the state at rest in the pose `qpos`, and the inverse (V, V) of its joint-space inertia."""
+    """Return MuJoCo's data of the robot at rest in the pose `qpos`, and the inverse (V, V) of the joint-space inertia."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
@@ -101,15 +100,15 @@ def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.Mj
 
 
 def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Return the Jacobian (3, V) of the centre of a shape."""
+    """Return the translational Jacobian (3, V) of the centre of a shape."""
     found = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, found, None, data.geom_xpos[geom], model.geom_bodyid[geom])
     return found
 
 
 def _static_torques(data: mujoco.MjData, jacobian: np.ndarray) -> np.ndarray:
-    """Return the generalised forces (V,) that hold the robot at rest, with the smallest forces of the feet that carry the
-    base.
+    """Return the generalised forces (V,) that hold the robot at rest. The feet, whose Jacobian is given, carry the base with
+    the least forces.
     """
     forces = np.linalg.lstsq(jacobian[:, :6].T, data.qfrc_bias[:6], rcond=None)[0]
     return np.asarray(data.qfrc_bias - jacobian.T @ forces)

@@ -16,30 +16,30 @@ TURNED = 0.01
 
 @dataclass(frozen=True)
 class Mirror:
-    """Left and right partners of D joints and F feet; a joint or foot in the middle is its own partner."""
+    """Left and right partners of D joints and F feet. A joint or foot in the middle is its own partner."""
 
     joints: tuple[int, ...]
-    """(D,) for each joint, the joint whose angle it takes in the mirrored robot."""
+    """(D,) for each joint, the index of the joint whose angle it takes in the mirrored robot."""
     signs: tuple[float, ...]
-    """(D,) sign of that angle, 1 or -1."""
+    """(D,) sign with which each joint takes its partner's angle, 1 or -1."""
     feet: tuple[int, ...]
-    """(F,) for each foot, the foot whose place it takes."""
+    """(F,) for each foot, the index of the foot whose place it takes in the mirrored robot."""
     passive: tuple[int, ...] = ()
-    """(P,) partners of passive hinges and slides, and (P,) their signs; both empty if some have no partner."""
+    """(P,) partners of passive hinges and slides, and (P,) signs; both are empty if one of them has no partner."""
     passive_signs: tuple[float, ...] = ()
 
     @classmethod
     def of(
         cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]], passive: Sequence[int] = ()
     ) -> "Mirror | None":
-        """Return the symmetry of a robot, found from the positions of its parts at zero angles.
+        """Return the symmetry of a robot, which is found from the positions of its parts at zero angles.
 
-        The robot has the hinges `joints` (ids), feet that consist of the shapes `feet`, and the passive hinges and slides
-        `passive` (ids). Return None if some joints or feet have no partner.
+        `joints` are the hinges with a motor (ids), `feet` the names of each foot's shapes, and `passive` the passive hinges
+        and slides (ids). Return None if a joint or a foot has no partner.
         """
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
-        data.qpos[3] = 1.0  # the base level at the origin
+        data.qpos[3] = 1.0  # puts the base level at the origin
         data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]] = 1.0
         mujoco.mj_kinematics(model, data)
         partners, signs = _joint_partners(model, data, joints)
@@ -51,8 +51,8 @@ class Mirror:
         return cls(tuple(partners), signs, tuple(foot_partners), tuple(others or ()), their_signs)
 
     def uneven_joint(self, angles: np.ndarray) -> int | None:
-        """Return the first joint whose angle differs from the mirrored angle of its partner, given `angles` (D,) [rad]; None
-        if the pose is its own mirror image.
+        """Return the first joint whose angle in `angles` (D,) [rad] differs from the mirrored angle of its partner; None if
+        the pose is symmetric.
         """
         image = np.asarray(self.signs) * angles[list(self.joints)]
         apart = np.flatnonzero(np.abs(image - angles) > TURNED)
@@ -62,22 +62,22 @@ class Mirror:
 def _joint_partners(
     model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]
 ) -> tuple[list[int] | None, tuple[float, ...]]:
-    """Return the partner and the sign of each hinge or slide; None if one has no partner."""
+    """Return partners and signs of hinges and slides; the partners are None if a joint has none."""
     anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
-    # Joints of a hip may share a point; a reflection keeps the absolute values of an axis' components, which tells them
-    # apart.
+    # The joints of a hip may share a point. They are told apart by the absolute values of the components of their axes,
+    # which a reflection keeps.
     partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
     if partners is None:
         return None, ()
-    # A hinge's axis is a pseudo-vector: the reflection keeps its y and reverses x and z. A slide's axis is an ordinary
-    # vector.
+    # A hinge's axis is a pseudo-vector: the reflection keeps its y and reverses x and z. A slide's axis is a vector: the
+    # reflection reverses its y.
     hinge = model.jnt_type[list(joints)] == mujoco.mjtJoint.mjJNT_HINGE
     signs = np.sign((np.where(hinge[:, None], -FLIP, FLIP) * axes * axes[partners]).sum(axis=1))
     return partners, tuple(float(sign) for sign in signs)
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
-    """Return for each row of `places` the nearest row of `reflected`; None if one is farther than APART from all."""
+    """Return for each row of `places` the index of the nearest row of `reflected`; None if a distance exceeds APART."""
     distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
     if distance.size == 0 or (distance.min(axis=1) > APART).any():
         return None

@@ -1,4 +1,4 @@
-"""Joints without a motor: their positions under springs and closed loops, for given angles of the driven joints."""
+"""Joints without a motor. Their positions follow from springs and closed loops at given angles of the driven joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import numpy as np
 from legged.errors import ConfigError
 
 STEPS = 8
-"""Number of steps in which driven joints are moved, so that loops stay nearly closed."""
+"""Number of steps in which driven joints are moved to their angles, so that loops stay nearly closed."""
 ITERATIONS = 30
 """Iterations of Newton's method in each step."""
 LARGEST_STEP = 0.3
@@ -17,16 +17,14 @@ LARGEST_STEP = 0.3
 CLOSED = 1e-6
 """Largest error of a closed loop [m] or [rad]."""
 LEAST_STIFFNESS = 1e-3
-"""Stiffness of joints without a spring, as a share of the stiffest spring's; it keeps them near their place if no loop moves
-them.
-"""
+"""Stiffness of joints without a spring, relative to the stiffest spring. It keeps joints in place that no loop moves."""
 TRIES = 20
-"""Number of poses drawn for each pose that is needed."""
+"""Largest number of poses that are drawn for each pose that is needed."""
 
 
 @dataclass(frozen=True)
 class PassiveJoints:
-    """Passive joints of a robot with D driven joints; P of them are hinges and slides, the others are balls."""
+    """Passive joints of a robot with D driven joints. P passive joints are hinges and slides, the others are balls."""
 
     model: mujoco.MjModel
     driven: tuple[int, ...]
@@ -34,9 +32,9 @@ class PassiveJoints:
     numbers: tuple[int, ...]
     """(P,) ids of the passive hinges and slides, whose coordinates can be observed."""
     names: tuple[str, ...]
-    """(P,) their names."""
+    """(P,) names of the passive hinges and slides."""
     qpos_columns: tuple[int, ...]
-    """(P,) columns in the generalised positions; `qvel_columns` in the velocities."""
+    """(P,) columns of the passive hinges and slides in the generalised positions; `qvel_columns`: in the velocities."""
     qvel_columns: tuple[int, ...]
 
     @classmethod
@@ -54,11 +52,11 @@ class PassiveJoints:
 
     def settle(self, angles: np.ndarray, start: np.ndarray) -> np.ndarray | None:
         """Return generalised positions (nq,) near `start` (nq,) with the driven joints at `angles` (D,), all loops closed and
-        the least spring energy; None if the loops do not close there.
+        the least spring energy. Return None if the loops do not close at these angles.
 
-        The joints are moved from `start` in steps. Springs and constraints are solved together: with K the stiffness, g the
-        spring forces, J and c the Jacobian and errors of the constraints, [K J'; J 0] [dq; l] = [-g; -c] is iterated. Gravity
-        is left out.
+        The driven joints are moved from `start` in steps. In each step [K J'; J 0] [dq; l] = [-g; -c] is iterated, with the
+        stiffness K, the gradient g of the spring energy, and the Jacobian J and the errors c of the constraints. Gravity is
+        left out.
         """
         model, data = self.model, mujoco.MjData(self.model)
         columns = model.jnt_qposadr[list(self.driven)]
@@ -90,7 +88,7 @@ class PassiveJoints:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        mujoco.mj_makeConstraint(self.model, data)  # collisions were not computed, so there are no contacts
+        mujoco.mj_makeConstraint(self.model, data)  # loops only: collisions were not computed, so there are no contacts
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
         if len(rows):
@@ -117,8 +115,8 @@ class PassiveJoints:
         return found
 
     def draw(self, default: np.ndarray, factor: tuple[float, float], count: int, seed: int, where: str) -> np.ndarray:
-        """Return (count, nq) poses: driven joints at the angles of `default` (nq,) times random numbers from `factor`, loops
-        closed. Poses that the loops or the ranges of passive joints do not allow are replaced by new ones.
+        """Return (count, nq) random poses with closed loops. The angles of driven joints are those of `default` (nq,) times
+        random numbers from `factor`. A pose is drawn again if its loops do not close or passive joints leave their ranges.
 
         Raises:
             ConfigError: too few poses are possible; `where` is the place of `factor` in the configuration.
@@ -131,14 +129,14 @@ class PassiveJoints:
                 poses.append(pose)
             if len(poses) == count:
                 return np.array(poses)
-        raise ConfigError(f"{where}: the robot's loops close in {len(poses)} of {TRIES * count} poses drawn, too few")
+        raise ConfigError(f"{where}: the robot's loops close in too few of {TRIES * count} random poses, in {len(poses)}")
 
 
 def default_qpos(
     model: mujoco.MjModel, driven: Sequence[int], angles: np.ndarray, passive: PassiveJoints | None, where: str
 ) -> np.ndarray:
-    """Return generalised positions (nq,): the base level at the origin, the joints `driven` (ids) at `angles`, passive joints
-    as springs and loops place them.
+    """Return generalised positions (nq,) with the base level at the origin, the joints `driven` (ids) at `angles` (D,), and
+    the passive joints where springs and loops put them.
 
     Raises:
         ConfigError: the loops do not close at those angles; `where` is the place of the angles in the configuration.
@@ -148,7 +146,7 @@ def default_qpos(
     if passive is None:
         qpos[model.jnt_qposadr[list(driven)]] = angles
         return qpos
-    for i in (*driven, *passive.numbers):  # a linkage may close in two ways; the ranges tell which one is meant
+    for i in (*driven, *passive.numbers):  # start inside the ranges, because a linkage may close in two ways
         if model.jnt_limited[i]:
             qpos[model.jnt_qposadr[i]] = np.clip(qpos[model.jnt_qposadr[i]], *model.jnt_range[i])
     settled = passive.settle(angles, qpos)

@@ -1,4 +1,4 @@
-"""Patterns of robot.yaml and of tasks, which match parts of names."""
+"""Patterns in robot.yaml and in tasks. A pattern matches all names that contain it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +22,7 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tu
 
 
 def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
-    """Return for each name the value of the longest pattern that it contains, (len(names),).
+    """Return (len(names),) values: for each name that of the longest pattern that the name contains.
 
     Raises:
         ConfigError: a pattern matches no name, or no pattern matches a name.

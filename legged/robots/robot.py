@@ -52,10 +52,10 @@ class RobotFile:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as a task needs it: D joints with a motor, in the order of the model, P passive hinges and slides, S collision
-    shapes, F feet, B contacts. "Joint" means a joint with a motor unless stated otherwise.
+    """What a task needs to know of a robot. It has D joints with a motor, in the order of the model, P passive hinges and
+    slides, S collision shapes, F feet and B contacts. "Joint" means a joint with a motor unless stated otherwise.
 
-    A contact is the unit for which a contact force is computed: one collision shape, or all shapes of a foot together.
+    A contact is a collision shape, or all shapes of a foot together, for which one contact force is computed.
     """
 
     name: str
@@ -65,42 +65,42 @@ class Robot:
     default_dof_pos: np.ndarray
     """(D,) joint angles at action 0 [rad]."""
     dof_pos_limits: np.ndarray
-    """(D, 2) lower and upper limit [rad]; infinite where the model has none."""
+    """(D, 2) lower and upper limits of joint angles [rad]; infinite for joints without a range."""
     dof_vel_limits: np.ndarray
-    """(D,) [rad/s]."""
+    """(D,) largest joint speeds [rad/s]."""
     torque_limits: np.ndarray
-    """(D,) [N m]."""
+    """(D,) largest motor torques [N m]."""
     stiffness: np.ndarray
     """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
     damping: np.ndarray
     armature: np.ndarray
-    """(D,) inertia of rotor and gear, as seen at the joint [kg m^2]."""
+    """(D,) inertia of rotor and gear, reflected to the joint [kg m^2]."""
     inertia: np.ndarray
-    """(D,) inertia that the motor of each joint turns with the robot in the air in its default pose [kg m^2]."""
+    """(D,) inertia that each motor turns if the robot is in the air in its default pose [kg m^2]."""
     swings: np.ndarray
     """(D,) True if the joint swings a leg forward and back in the default pose."""
     height: float
-    """Base above the ground when the robot stands level in its default pose [m]."""
+    """Height of the base above the ground when the robot stands level in its default pose [m]."""
     qpos_columns: tuple[int, ...]
-    """(D,) column of each joint's angle in MuJoCo's generalised positions; `qvel_columns` in the velocities."""
+    """(D,) column of each joint in MuJoCo's generalised positions; `qvel_columns` are the columns in the velocities."""
     qvel_columns: tuple[int, ...]
     passive: PassiveJoints | None
     """Joints without a motor; None if every joint has one."""
     default_qpos: np.ndarray
-    """(nq,) MuJoCo's generalised positions at action 0: the base level at the origin, passive joints at rest between springs
-    and loops.
+    """(nq,) MuJoCo's generalised positions at action 0, with the base level at the origin and passive joints where springs
+    and loops put them.
     """
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
     contact_of_shape: tuple[int, ...]
     """(S,) index of the contact that each shape belongs to."""
     contact_names: tuple[str, ...]
-    """Names of the B contacts: the name of the shape; for a foot of several shapes, the common beginning of their names."""
+    """Names of the B contacts: the shape's name or, for a foot of several shapes, the common beginning of their names."""
     feet_shapes: tuple[tuple[str, ...], ...]
-    """The shapes of each of the F feet."""
+    """(F,) names of the shapes of each foot."""
     feet_indices: tuple[int, ...]
-    """(F,) indices of the feet among the contacts; the next two are those of the penalised contacts, and of those that end an
-    episode.
+    """(F,) indices of the feet among the contacts. The next two fields are indices of penalised contacts, and of contacts
+    that end an episode.
     """
     penalised_indices: tuple[int, ...]
     termination_indices: tuple[int, ...]
@@ -109,7 +109,7 @@ class Robot:
     base_mass: float
     """Mass of the floating body [kg]."""
     adaptations: tuple[str, ...]
-    """One line for each change that was made to the model's file for the engines."""
+    """One line for each change that was made to the model for the engines."""
     mirror: Mirror | None
     """Left and right partners of joints and feet; None if the robot is not symmetric."""
 
@@ -126,7 +126,7 @@ class Robot:
         return self.folder / self.file.model
 
     def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
-        """Return the values (D,) of a pattern table.
+        """Return the value of each joint (D,) from a table of joint-name pattern -> value.
 
         Raises:
             ConfigError: a pattern matches no joint, or no pattern matches a joint.
@@ -134,15 +134,15 @@ class Robot:
         return match_values(table, self.joint_names, where)
 
     def with_armature(self, armature: np.ndarray) -> "Robot":
-        """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` counts only the
-        change of its own rotor; the true one is a little larger where other rotors have become heavier.
+        """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` is changed only by
+        its own rotor. The true inertia is a little larger if other rotors have become heavier.
         """
         return replace(self, armature=armature, inertia=self.inertia + armature - self.armature)
 
 
 def load_robot(name: str, where: str = "robot") -> Robot:
-    """Return the robot of that name under resources/robots/, or in the folder `name`; `where` is the place of the name in the
-    configuration, for errors.
+    """Return the robot in the folder `name` under resources/robots/, else in the folder with the path `name`. `where` is the
+    place of the name in the configuration, for error messages.
 
     Raises:
         ConfigError: there is no such robot, or robot.yaml and the model contradict each other.
@@ -217,7 +217,7 @@ def _folder(name: str, where: str) -> Path:
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()
-    if len(Path(name).parts) > 1:  # the configuration of a run from another machine names the folder on that machine
+    if len(Path(name).parts) > 1:  # a run from another machine names a folder of that machine
         raise ConfigError(
             f"{where}: there is no robot {shown(name)}: that folder has no robot.yaml. "
             "If the robot was moved, give its new folder: robot=FOLDER"

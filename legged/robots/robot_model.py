@@ -1,4 +1,4 @@
-"""Reading of a robot's MJCF, and checks of the conditions that engines rely on."""
+"""Reading of a robot's MJCF, with checks of the conditions that engines rely on."""
 
 import contextlib
 import re
@@ -17,16 +17,16 @@ from legged.robots.reserved_names import RESERVED
 GROUPS = 31
 """Number of actuator groups that a model can disable; they are numbered from 0."""
 LARGEST_NUMBER = 1e12
-"""Largest number of a model; with larger ones float32, which GPUs compute in, overflows."""
+"""Largest number allowed in a model; with larger numbers float32, in which GPUs compute, overflows."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
 """Prefixes of the names of a model's arrays of numbers."""
 
 
 def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
-    """Return the model in `file` in `folder`; `where` is the place of its name in the configuration, for errors.
+    """Return the model in `file` in `folder`; `where` is the file that names the model, for error messages.
 
     Raises:
-        ConfigError: there is no such file, MuJoCo refuses it, or it holds numbers that are not finite.
+        ConfigError: there is no such file, MuJoCo refuses it, or its numbers or options are not allowed.
     """
     path = folder / file
     if not exists(path) or not path.is_file():
@@ -38,7 +38,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
             model = robot_spec_of(path).compile()
     except ConfigError as error:
         raise ConfigError(f"{where}: model: {error}") from error
-    except Exception as error:  # MuJoCo's errors have no class of their own
+    except Exception as error:  # MuJoCo raises errors of no special class
         raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
     if warnings:
         raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
@@ -54,22 +54,22 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
         if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
     for group in disabled_groups(model):
-        raise ConfigError(f"{at}: option actuatorgroupdisable: motors are in group {group}, which it disables")
+        raise ConfigError(f"{at}: option actuatorgroupdisable: group {group} has motors and must not be disabled")
     for flag in ("SLEEP", "IPC"):
         if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
-            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; its state is not kept per robot, leave it out")
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; leave it out, its state is not kept per robot")
     return model
 
 
 def disabled_groups(model: mujoco.MjModel) -> list[int]:
-    """Return the actuator groups that a model uses and disables."""
+    """Return the actuator groups that have actuators but are disabled in the model's options."""
     groups = sorted({int(group) for group in model.actuator_group if 0 <= group < GROUPS})
     return [group for group in groups if model.opt.disableactuator >> group & 1]
 
 
 @contextlib.contextmanager
 def _warnings_to(warnings: list[str]) -> Iterator[None]:
-    """Collect MuJoCo's warnings, which MuJoCo would print and write to a file in the working directory."""
+    """Append MuJoCo's warnings to a list. MuJoCo itself would print them and write a file into the working directory."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)
     try:
@@ -79,8 +79,8 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[str] = ()) -> None:
-    """Check the conditions that engines rely on: one free base, then the joints; one motor for each joint that no pattern of
-    `passive` names, in the same order; hinges as the joints with a motor; named collision shapes.
+    """Check the conditions that engines rely on. The first joint is the base's free joint, and all others come after it. Each
+    joint that no pattern in `passive` matches is a hinge with one motor, in the same order. Collision shapes have names.
 
     Raises:
         ConfigError: a condition is not met; the message begins with `where`.
@@ -93,7 +93,7 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
             continue
         name, body = model.geom(i).name, model.body(model.geom_bodyid[i])
         if body.weldid[0] == 0:
-            alone = "the model is the robot alone, the task brings the ground"
+            alone = "leave it out, because the task adds the ground"
             raise ConfigError(f"{where}: model: geom '{name}' is fixed to the world; {alone}")
         if not name:
             raise ConfigError(f"{where}: model: every collision geom needs a name; one of body '{body.name}' has none")
@@ -111,7 +111,7 @@ def base_mass(model: mujoco.MjModel, base: str) -> float:
 
 
 def passive_joints(model: mujoco.MjModel, patterns: Sequence[str], where: str) -> list[int]:
-    """Return the ids of the passive joints, which the patterns name; never the base's.
+    """Return the ids of the passive joints, whose names the patterns match. The base's joint is never passive.
 
     Raises:
         ConfigError: a pattern is in no joint's name; `where` is the file of the patterns.
@@ -133,7 +133,7 @@ def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], wher
     joints = driven_joints(model, passive)
     free = model.jnt_type == kinds.mjJNT_FREE
     if model.njnt == 0 or not free[0] or free.sum() > 1 or (model.jnt_type[joints] != kinds.mjJNT_HINGE).any():
-        but = "; slides and balls may be named by passive_joints" if free.sum() == 1 and free[0] else ""
+        but = "; list slides and balls under passive_joints" if free.sum() == 1 and free[0] else ""
         raise ConfigError(f"{where}: model: needs one free joint, on the base, followed by hinges only{but}")
     if not joints:
         raise ConfigError(f"{where}: model: has no hinge with a motor, so nothing could move the robot")
@@ -150,7 +150,7 @@ def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -
     on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
     if driven != names:
-        extra = "; a joint that nothing drives belongs under passive_joints" if len(driven) < len(names) else ""
+        extra = "; list joints without a motor under passive_joints" if len(driven) < len(names) else ""
         order = "needs one motor per hinge in the same order"
         raise ConfigError(f"{where}: model: {order}; hinges {names}, motors {driven}{extra}")
     for i, joint in enumerate(names):
@@ -170,7 +170,7 @@ def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
     ):
         return "is not a torque motor: the task computes torques and needs <motor>, not <position>, <velocity> or the like"
     if _first(model.actuator_gear[i]) != 1.0:
-        return f"has a gear of {model.actuator_gear[i, 0]:g}; torques are those of the joints, so it must be 1"
+        return f"has a gear of {model.actuator_gear[i, 0]:g}; the gear must be 1, because controls are the joints' torques"
     return ""
 
 
@@ -180,7 +180,7 @@ def _first(values: Sequence[float]) -> float:
 
 
 def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
-    """Return the reason why an actuator's range of forces is not a torque limit; '' if it is one."""
+    """Return the reason why an actuator's forcerange is not a valid torque limit; '' if it is valid."""
     low, high = model.actuator_forcerange[i]
     if not model.actuator_forcelimited[i]:
         return "has no limit: every motor needs a forcerange (the torque limit)"
@@ -189,5 +189,5 @@ def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
     if model.actuator_ctrllimited[i] and (model.actuator_ctrlrange[i] != (low, high)).any():
         lowest, highest = model.actuator_ctrlrange[i]
         if lowest > low or highest < high:
-            return f"has ctrlrange [{lowest:g}, {highest:g}], which cuts off its forcerange [{low:g}, {high:g}]"
+            return f"has ctrlrange [{lowest:g}, {highest:g}]; it must not be narrower than forcerange [{low:g}, {high:g}]"
     return ""

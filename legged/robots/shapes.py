@@ -1,4 +1,4 @@
-"""Collision shapes of a robot: those of each foot, and the contact that each shape belongs to."""
+"""Collision shapes of a robot: the shapes of each foot, and the contact that each shape belongs to."""
 
 import itertools
 from collections.abc import Sequence
@@ -11,18 +11,18 @@ from legged.robots.patterns import match_names
 
 @dataclass(frozen=True)
 class Shapes:
-    """S collision shapes in the order of the model, and B contacts, each with one contact force. All shapes of a foot share
-    one contact, and every other shape has its own. Contacts are in the order of their first shapes.
+    """S collision shapes in the order of the model, and B contacts, for each of which one force is computed. All shapes of a
+    foot share a contact, and every other shape has its own. Contacts are in the order of their first shapes.
     """
 
     names: tuple[str, ...]
-    """(S,) names."""
+    """(S,) names of the shapes."""
     bodies: tuple[str, ...]
-    """(S,) name of the body of each shape."""
+    """(S,) name of each shape's body."""
     contact: tuple[int, ...]
     """(S,) index of the contact of each shape."""
     contact_names: tuple[str, ...]
-    """(B,) names."""
+    """(B,) names of the contacts."""
     feet_shapes: tuple[tuple[str, ...], ...]
     """(F,) names of the shapes of each foot."""
     feet: tuple[int, ...]
@@ -30,7 +30,7 @@ class Shapes:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, feet: Sequence[str], where: str) -> "Shapes":
-        """Return the shapes of a model whose feet the patterns `feet` name; shapes of one body are one foot.
+        """Return the shapes of a model. The patterns `feet` name the feet's shapes; shapes of one body are one foot.
 
         Raises:
             ConfigError: a pattern matches neither shape nor body; `where` is the place of the patterns.
@@ -39,7 +39,7 @@ class Shapes:
         names = tuple(geom.name for geom in geoms)
         bodies = tuple(model.body(geom.bodyid[0]).name for geom in geoms)
         of_foot = set(match_shapes(feet, names, bodies, where))
-        members: dict[tuple[str, int], list[int]] = {}  # the key of a foot is its body, that of any other shape its index
+        members: dict[tuple[str, int], list[int]] = {}  # the key of a foot is its body; the key of another shape is its index
         for i, body in enumerate(bodies):
             members.setdefault((body, -1) if i in of_foot else ("", i), []).append(i)
         contact = [0] * len(names)
@@ -56,13 +56,13 @@ class Shapes:
         )
 
     def contacts(self, patterns: Sequence[str], where: str) -> tuple[int, ...]:
-        """Return the indices of the contacts of the shapes that the patterns name, each once. Raises as `of`."""
+        """Return the indices, each once, of the contacts of all shapes that the patterns name. Raises: see `of`."""
         return tuple(sorted({self.contact[i] for i in match_shapes(patterns, self.names, self.bodies, where)}))
 
 
 def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence[str], where: str) -> tuple[int, ...]:
-    """Return the indices of the shapes that any of the patterns names, in their order. A pattern names the shapes whose names
-    contain it; if no shape's name does, it names all shapes of the bodies whose names contain it.
+    """Return the indices, in ascending order, of the shapes that the patterns name. A pattern names all shapes whose names
+    contain it. If there are none, it names all shapes of the bodies whose names contain it.
 
     Raises:
         ConfigError: a pattern is in no name; `where` is the place of the patterns.
@@ -75,8 +75,8 @@ def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence
 
 
 def _common_name(names: Sequence[str], body: str) -> str:
-    """Return the name of a contact of several shapes: the common beginning of their names without separators, else the body's
-    name.
+    """Return the name of a contact: the common beginning of its shapes' `names`, without separators at the end, or the name
+    of the `body` if they have none.
     """
     if len(names) == 1:
         return names[0]

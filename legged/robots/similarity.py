@@ -1,8 +1,8 @@
 """Size of a robot, and factors that rescale numbers written for another robot.
 
-Bodies of different size move alike if lengths grow by h, times by sqrt(h / g) and masses by m, so that speeds grow by sqrt(g
-h), forces by m g and torques by m g h: dynamic similarity (Alexander and Jayes, J. Zool. 201, 1983). Here m is the robot's
-mass and h its standing height; gravity is the same for all.
+Robots of different sizes move alike (dynamic similarity; Alexander and Jayes, J. Zool. 201, 1983) if lengths are proportional
+to h, times to sqrt(h / g) and masses to m. Then speeds are proportional to sqrt(g h), forces to m g and torques to m g h.
+Here m is the robot's mass, h its standing height, and g gravity, which is the same for all robots.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Size:
 
 
 def size_of(name: str, where: str = "robot") -> Size:
-    """Return the size of the robot that `load_robot` loads by this name.
+    """Return the size of the robot called `name`; for `name` and `where` see `load_robot`.
 
     Raises:
         ConfigError: the robot cannot be loaded.
@@ -33,11 +33,11 @@ def size_of(name: str, where: str = "robot") -> Size:
 
 
 def growth(reference: Size, robot: Size) -> dict[str, float]:
-    """Return the factors of masses ("kg"), lengths ("m") and times ("s") from one robot to another."""
+    """Return the factors on masses ("kg"), lengths ("m") and times ("s") from the robot `reference` to `robot`."""
     length = robot.height / reference.height
     return {"kg": robot.mass / reference.mass, "m": length, "s": sqrt(length)}
 
 
 def grown(unit: str, reference: Size, robot: Size) -> float:
-    """Return the factor of a quantity of that unit, as "m/s" or "N^2 m^2", from one robot to another."""
+    """Return the factor on a quantity in `unit`, such as "m/s" or "N^2 m^2", from the robot `reference` to `robot`."""
     return factor(unit, growth(reference, robot))

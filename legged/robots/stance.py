@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 
 ALONG = 0.7
-"""Least y component, in the base's frame, of the axis of a joint that swings a leg forward: within 45 degrees."""
+"""Least y component, in the base's frame, of the axis of a joint that swings a leg forward: at most 45 degrees from y."""
 
 
 def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
-    """Return MuJoCo's data at the generalised positions `qpos`, with poses computed."""
+    """Return MuJoCo's data with the poses of all bodies at the generalised positions `qpos` (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -40,18 +40,17 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
 
 
 def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float:
-    """Return the height of the base above the lowest point of the collision shapes at `qpos`, where the base is level [m]."""
+    """Return the height of the base above the lowest collision shape at `qpos` (nq,), in which the base is level [m]."""
     data = stance(model, qpos)
     shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))
 
 
 def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return (D,) True for each of the hinges `joints` (ids) that swings a leg forward and back: hip pitch, knee and ankle
-    pitch.
+    """Return flags (D,) of those hinges `joints` (ids) that swing a leg forward and back: hip pitch, knee and ankle pitch.
 
-    These are the hinges between the base and one of the shapes `feet` (ids) whose axes point sideways at `qpos`, with the
-    base level.
+    Each of these hinges lies between the base and one of the shapes `feet` (ids), and its axis points sideways in the pose
+    `qpos`, in which the base is level.
     """
     data = stance(model, qpos)
     on_leg = set()

@@ -158,7 +158,7 @@ def test_two_policies_are_compared_joint_by_joint():
     row = tables_of(both)["torque [N m]"].rows[1]
     assert [text_of(cell) for cell in row] == ["right_hip", "3.000", "0.000", "5.500", "0.000", "+2.500"]
     other.about["joints"] = [*other.about["joints"][:3], {**other.about["joints"][3], "name": "tail"}]
-    with pytest.raises(ConfigError, match=r"POLICY: the two have other joints \(right_knee, tail\)"):
+    with pytest.raises(ConfigError, match=r"POLICY: the joints of the two policies differ \(right_knee, tail\)"):
         tables_of({"A": both["A"], "B": joint_statistics(other)})
 
 

@@ -146,7 +146,7 @@ def test_two_policies_are_compared(capsys):
     capsys.readouterr()
     cheetah = str(POLICY.parent / "half_cheetah")
     assert call(compare.main, ["out", cheetah, "--episodes", "1", "--physics", "mujoco", "sim.threads=1"]) == 2
-    assert "POLICY: the two have other joints" in capsys.readouterr().err
+    assert "POLICY: the joints of the two policies differ" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -287,12 +287,12 @@ def test_mistake_in_robot_yaml_is_an_error_that_names_file_and_field(folder, old
         ('forcerange="-80 80"', 'forcerange="80 -80"', "every motor needs a forcerange"),
         ('forcerange="-80 80"', 'forcerange="-inf inf"', "numbers must be finite and below 1e+12 (actuator_forcerange"),
         ('forcerange="-80 80"', 'forcerange="-80 90"', "the same both ways"),
-        ('ctrlrange="-80 80"', 'ctrlrange="-1 1"', "ctrlrange [-1, 1], which cuts off its forcerange [-80, 80]"),
+        ('ctrlrange="-80 80"', 'ctrlrange="-1 1"', "ctrlrange [-1, 1]; it must not be narrower than forcerange [-80, 80]"),
         # What the scene brings.
         ('name="LF_FOOT"', 'name="floor"', "geom 'floor': the scene needs this name"),
         ('name="LF_FOOT"', 'name="terrain_3"', "geom 'terrain_3': the scene needs this name"),
         ("<worldbody>", '<option><flag contact="disable"/></option><worldbody>', "contact is disabled"),
-        ("<worldbody>", '<option actuatorgroupdisable="0 2"/><worldbody>', "motors are in group 0, which it disables"),
+        ("<worldbody>", '<option actuatorgroupdisable="0 2"/><worldbody>', "group 0 has motors and must not be disabled"),
         ("<worldbody>", '<option><flag sleep="enable"/></option><worldbody>', "sleep is enabled"),
         # Numbers.
         ('mass="26.37317"', 'mass="inf"', "numbers must be finite"),

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 @cache
 def _templates() -> "Environment":
-    from jinja2 import Environment, PackageLoader  # takes a while
+    from jinja2 import Environment, PackageLoader  # the import takes a while
 
     return Environment(loader=PackageLoader(__name__), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 

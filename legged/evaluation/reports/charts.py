@@ -1,7 +1,7 @@
 """Charts of reports: lines with bands, stacked areas and heat maps as SVG, and several charts in one PNG.
 
-Each SVG can be a file of its own, or part of a page without a change. Colours are those of M. Okabe and K. Ito (Color
-Universal Design, 2008), which people with any colour vision can distinguish. Lines also differ in their dashes.
+Each SVG can be saved as a file or inserted into a page. Colours are those of M. Okabe and K. Ito (Color Universal Design,
+2008), which people with any colour vision can distinguish. Lines also differ in their dashes.
 """
 
 import math
@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0
 """Margins around the axes [SVG units]."""
 MOST_POINTS = 240
-"""Largest number of points of a line; a longer line is averaged to as many. A drawing has hardly more pixels."""
+"""Largest number of points of a line; a longer line is averaged, because a drawing has hardly more pixels."""
 LETTER = 6.3
 """Mean width of a letter of the legend [SVG units]."""
 INK, QUIET, GRID, REST = "#1b1f24", "#57606a", "#e1e5e9", "#9aa4ae"
@@ -36,7 +36,7 @@ class Line:
     """A curve: x and y (n,); `band` is the lower and the upper edge (n,) of an area around it."""
 
     name: str
-    """Name in the legend; a line without a name gets the chart's title."""
+    """Name in the legend. A line without a name is not in the legend; the page's script shows the chart's title for it."""
     x: np.ndarray
     y: np.ndarray
     band: tuple[np.ndarray, np.ndarray] | None = None
@@ -54,7 +54,7 @@ class Chart:
     x_label: str
     lines: Sequence[Line] = ()
     unit: str = "iteration"
-    """Name of a value of x."""
+    """Name of the quantity x, shown with a value of x."""
     log: bool = False
     percent: bool = False
     """True: y is a share, and its axis ends at 100 %."""
@@ -64,8 +64,8 @@ class Chart:
     """Names and x of dotted vertical lines."""
 
     def cleaned(self) -> "Chart":
-        """Return the chart without values that can't be drawn: not finite, or not positive on a log axis. Lines have as many
-        points as can be seen, and their own styles.
+        """Return the chart without the values that can't be drawn, which are not finite, or not positive on a log axis. Its
+        lines have at most MOST_POINTS points, and each has a style.
         """
         lines = []
         for i, line in enumerate(self.lines):
@@ -96,7 +96,7 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
         for axis, chart in zip(axes.flat, charts, strict=False):
             draw_panel(axis, chart)
             names = axis.get_legend_handles_labels()[1]
-            if names and names != before:  # one legend for panels with the same lines
+            if names and names != before:  # a panel with the same lines as the panel before needs no legend
                 axis.legend(fontsize="small", frameon=False)
             before = names
             if iteration_s is not None:
@@ -107,7 +107,7 @@ def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_
 
 
 def draw_panel(axis: Any, chart: Chart) -> None:
-    """Draw a chart into axes of matplotlib."""
+    """Draw a chart into the matplotlib axes `axis`."""
     from matplotlib.ticker import PercentFormatter
 
     chart = chart.cleaned()
@@ -131,7 +131,7 @@ def draw_panel(axis: Any, chart: Chart) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if not chart.log:
         low, high = _y_range(chart)
-        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # markers at 100 % are not cut off
+        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # so that markers at 100 % are not cut off
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -140,7 +140,7 @@ def draw_panel(axis: Any, chart: Chart) -> None:
 
 
 def curves(chart: Chart) -> str:
-    """Draw the lines of a chart."""
+    """Return the drawing (SVG) of a chart's lines."""
     chart = chart.cleaned()
     xs = np.concatenate([*(line.x for line in chart.lines), [x for _, x in chart.walls]])
     ends = (float(xs.min()), float(xs.max())) if len(xs) else (0.0, 1.0)
@@ -157,7 +157,7 @@ def curves(chart: Chart) -> str:
 
 
 def stacked(chart: Chart, x: np.ndarray, parts: dict[str, np.ndarray]) -> str:
-    """Draw stacked areas (n,) over x (n,), positive parts above 0 and negative parts below 0, and their sum as a line."""
+    """Return an SVG of `parts` (n,) over x (n,) as stacked areas, with negative values below 0, and their sum as a line."""
     x, *values = _thinned(x, *parts.values())
     ups, downs = (np.cumsum([np.zeros(len(x)), *(of(v, 0.0) for v in values)], axis=0) for of in (np.maximum, np.minimum))
     sums = replace(chart, lines=[Line("", x, edge) for edge in (ups[-1], downs[-1])])
@@ -175,7 +175,7 @@ def stacked(chart: Chart, x: np.ndarray, parts: dict[str, np.ndarray]) -> str:
 
 
 def heat_map(title: str, x_label: str, y_label: str, x: Sequence[float], y: Sequence[float], values: np.ndarray) -> str:
-    """Draw values (len(x), len(y)) as shades from white (0) to blue (the largest), with their numbers in them."""
+    """Return an SVG of values (len(x), len(y)) as cells with numbers, shaded from white (0) to blue (the largest value)."""
     frame = _Frame(Chart(title, x_label), (0.0, float(len(x))), (0.0, float(len(y))), [])
     largest = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
     width, height = np.diff(frame.px([0.0, 1.0]))[0], -np.diff(frame.py([0.0, 1.0]))[0]
@@ -197,7 +197,7 @@ def shade(share: float) -> str:
 
 
 def sheet(drawings: Sequence[str], columns: int = 2) -> str:
-    """Return drawings as one, side by side."""
+    """Return one SVG with all drawings, `columns` side by side."""
     sizes = [tuple(map(float, re.findall(r'viewBox="0 0 (\S+) (\S+)"', one)[0])) for one in drawings]
     top, body = 0.0, []
     for start in range(0, len(drawings), columns):
@@ -213,7 +213,7 @@ def sheet(drawings: Sequence[str], columns: int = 2) -> str:
 
 
 class _Frame:
-    """Axes, title and legend of a drawing that is being made."""
+    """A drawing under construction: axes, title, legend and marks."""
 
     def __init__(self, chart: Chart, x: tuple[float, float], y: tuple[float, float], names: Sequence[str]) -> None:
         self.chart, self.y = chart, y
@@ -222,7 +222,7 @@ class _Frame:
         self._keys: list[dict[str, Any]] = []
         self._places: list[dict[str, float]] = []
         left, row = LEFT, 0
-        for name in names:  # a new row of the legend if the last row has no room
+        for name in names:  # start a new row of the legend if the name does not fit into the last row
             width = 28.0 + LETTER * len(name)
             left, row = (LEFT, row + 1) if left + width > WIDTH - 2.0 and left > LEFT else (left, row)
             self._places.append({"x": left, "y": TOP + 6.0 + 16.0 * row})
@@ -233,11 +233,11 @@ class _Frame:
         self.box = f"{LEFT:g} {self.right:g} {self.x[0]:.8g} {self.x[1]:.8g}"
 
     def px(self, x: ArrayLike) -> np.ndarray:
-        """Return the horizontal places of values of x (n,)."""
+        """Return the horizontal positions (n,) [SVG units] of values of x (n,)."""
         return LEFT + (np.asarray(x) - self.x[0]) / (self.x[1] - self.x[0]) * (self.right - LEFT)
 
     def py(self, y: ArrayLike) -> np.ndarray:
-        """Return the vertical places of values of y (n,)."""
+        """Return the vertical positions (n,) [SVG units] of values of y (n,)."""
         low, high, values = *self.y, np.asarray(y)
         if self.chart.log:
             low, high, values = math.log10(low), math.log10(high), np.log10(np.maximum(values, 1e-300))
@@ -258,17 +258,17 @@ class _Frame:
         self.marks.append({"kind": "line", **look, **self.data(line, color)})
 
     def data(self, line: Line, color: str) -> dict[str, str]:
-        """Return the attributes of a line that the page's script reads: its name, and its values at each x."""
+        """Return the attributes of a line that the page's script reads: name, colour, x, and the values at each x."""
         values, unit = (100.0 * line.y, "\u00a0%") if self.chart.percent else (line.y, "")
         x, v = " ".join(f"{value:.6g}" for value in line.x), " ".join(f"{value:.4g}{unit}" for value in values)
         return {"name": line.name or self.chart.title, "color": color, "x": x, "v": v}
 
     def key(self, name: str, color: str, dash: str = "", area: bool = False) -> None:
-        """Put a name into the legend, with its line or with a square of its colour."""
+        """Add a name to the legend, with a piece of its line, or with a coloured square for an area."""
         self._keys.append({**self._places[len(self._keys)], "name": name, "color": color, "dash": dash, "area": area})
 
     def svg(self, **parts: Any) -> str:
-        """Return the whole drawing; `parts` are the cells of a heat map, and names that take the place of ticks."""
+        """Return the whole drawing. For a heat map, `parts` holds the cells and the labels that replace the ticks."""
         chart = self.chart
         if "cells" not in parts:
             found = _log_ticks(*self.y) if chart.log else ticks(*self.y, 5)
@@ -285,7 +285,7 @@ class _Frame:
 
 
 def _thinned(*columns: np.ndarray) -> list[np.ndarray]:
-    """Return columns (n,) of at most MOST_POINTS values: means of neighbours; the first and the last value are kept."""
+    """Return the columns (n,) with at most MOST_POINTS values: means of neighbours, and the first and the last value."""
     count = len(columns[0])
     if count <= MOST_POINTS:
         return [np.asarray(column, dtype=float) for column in columns]
@@ -319,14 +319,14 @@ def ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Return powers of ten from `low` to `high`, with 2 and 5 times them where there are few."""
+    """Return the powers of ten from `low` to `high`. If there are few, 2 and 5 times the powers are added."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     factors = (1, 2, 5) if high / low < 200.0 else (1,)
     return [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]
 
 
 def short(value: float) -> str:
-    """Return the number of a tick in few letters: 1500000 -> 1.5M."""
+    """Return a short text for the number of a tick: 1500000 -> 1.5M."""
     for limit, unit, letter in ((1e9, 1e9, "G"), (1e6, 1e6, "M"), (1e4, 1e3, "k")):
         if abs(value) >= limit:
             return f"{value / unit:g}{letter}"

@@ -1,5 +1,5 @@
-"""Comparisons: evaluations in tables for the screen, and runs on a page with settings, curves and evaluations. On the screen
-the evaluations of one task in one engine under one condition are its seeds.
+"""Comparisons: evaluations in tables for the screen, and runs on a page with settings, curves and evaluations. On the screen,
+evaluations of the same task in the same engine under the same conditions count as its seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from legged.evaluation.success import success_chart, success_line, types_in
 from legged.tables import screen_table
 
 Key = tuple[str, str, str]
-"""Task, engine, and conditions that differ from the policy's own or between evaluations."""
+"""Task, engine, and conditions as text: changed fields, and the grid of commands if grids differ."""
 Evaluations = dict[Key, list[dict[str, Any]]]
 """Key -> results, one for each seed."""
 FIGURES = {
@@ -47,16 +47,16 @@ FIGURES = {
 }
 """Label -> path in a result, factor, format."""
 Counted = dict[tuple[float, ...], float] | tuple[float, float, int] | tuple[int, int] | float | None
-"""A figure of a run: errors by command; mean, sample standard deviation and number; successes and trials; a bare number."""
+"""A figure of a run: command -> error; (mean, sample standard deviation, count); (successes, trials); or a number."""
 Measured = tuple[float, Interval | None] | None
-"""A figure and its interval, if it has one; None if a run lacks the figure."""
+"""A figure and its confidence interval (None if it has none); None instead of both if a run lacks the figure."""
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
     """Keep only the terrain types `types` in the results, in that order.
 
     Raises:
-        ConfigError: no result has a type.
+        ConfigError: one of the types is in no result.
     """
     there = {name for result in results for name in types_in(result)}
     for name in types:
@@ -80,21 +80,21 @@ def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
 
 
 def conditions_of(results: Sequence[dict[str, Any] | None]) -> list[tuple[str, str]]:
-    """Return for each evaluation its changed fields and, if the grids of commands differ, its grid, as text."""
+    """Return two texts for each evaluation: its changed fields, and its grid of commands if the grids differ."""
     grids = [grid_text(result or {}) for result in results]
     told = len(set(grids) - {""}) > 1
     return [(changes_text(result or {}), grid if told else "") for result, grid in zip(results, grids, strict=True)]
 
 
 def spread(values: Sequence[float]) -> float:
-    """Return the largest distance of a value from the mean, as a share of the mean; 0 if all values are 0."""
+    """Return the largest deviation of a value from the mean, relative to the mean; 0 if all values are 0."""
     middle = mean(values)
     return max(abs(value - middle) for value in values) / middle if middle else 0.0
 
 
 def tracking_table(groups: Evaluations) -> ScreenTable:
-    """Return a table with one column for each group: the mean over its seeds, and the distance of the farthest seed from
-    it.
+    """Return a table with one column for each group: the mean over the seeds, and the largest deviation of a seed from the
+    mean.
     """
     rows = []
     for label, (path, factor, form) in FIGURES.items():
@@ -126,19 +126,19 @@ def _heads(groups: Evaluations) -> list[str]:
 
 
 def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
-    """Return a mean as text. Brackets hold the spread of several values, and their number if some seeds lack a value."""
+    """Return a mean as text. Brackets hold the spread of several values and, if seeds lack a value, how many have one."""
     notes = [spread_text] if len(values) > 1 else []
     notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
     return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
 
 
 def _range_text(values: Sequence[float], seeds: int, form: str, range_form: str) -> str:
-    """Return a mean with the range of the values; an empty text without values."""
+    """Return a mean and the range of the values as text; an empty text without values."""
     return _mean_text(values, seeds, form, f"{min(values):{range_form}} to {max(values):{range_form}}") if values else ""
 
 
 def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
-    """Return label -> number of the compared figures of an evaluation of episodes."""
+    """Return label -> number, for the figures by which evaluations of episodes are compared."""
     return {
         "return": episodes["return"]["mean"],
         "standard deviation of the return": episodes["return"]["std"],
@@ -151,14 +151,14 @@ def _episode_figures(episodes: dict[str, Any]) -> dict[str, float]:
 
 
 def heading(key: Key, seeds: int) -> str:
-    """Return the heading of a group."""
+    """Return the heading of a group's column."""
     task, physics, conditions = key
     text = f"{task}\n{engine_of(physics).label}, {seeds} seed{'s' if seeds > 1 else ''}"
     return f"{text}\n{conditions}" if conditions else text
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> success of every seed that was measured on a type, for the sizes that these seeds share."""
+    """Return size -> success of each seed that was measured on `terrain`, for the sizes that these seeds share."""
     entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
@@ -166,7 +166,7 @@ def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[
 
 
 def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> one of its entries, for all types that were measured."""
+    """Return terrain type -> the entry of one of the results, for all types that were measured."""
     entries = [types_in(result) for results in groups.values() for result in results]
     return {name: entry for one in entries for name, entry in one.items()}
 
@@ -206,7 +206,7 @@ def draw_comparison(groups: Evaluations, path: Path) -> None:
 
 
 def comparison_parts(records: Sequence[Record]) -> list[Part]:
-    """Return the page on some runs, which compares all with the first."""
+    """Return the parts of a page that compares runs with the first of them."""
     common, names = apart(labels([record.folder for record in records], [record.config for record in records]))
     noted = any(record.note for record in records)
     rows: list[list[Cell]] = []
@@ -228,7 +228,7 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
 
 
 def apart(names: Sequence[str]) -> tuple[str, list[str]]:
-    """Return the common parts of runs' labels, and the rest of each label; no common parts if a label would become empty."""
+    """Return the common parts of runs' labels, and the rest of each label; no common parts if a rest would be empty."""
     parts = [name.split(", ") for name in names]
     common = [part for part in parts[0] if all(part in one for one in parts)]
     rest = [", ".join(part for part in one if part not in common) for one in parts]
@@ -259,7 +259,7 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
     if not parts:
         return [Heading("Evaluation"), Paragraph("No two of the runs were evaluated in the same engine.")]
     text = (
-        "Brackets hold intervals of 95 %: Wilson's for shares, Newcombe's for their differences, a bootstrap over the"
+        "Brackets hold 95 % confidence intervals: Wilson's for shares, Newcombe's for their differences, a bootstrap over the"
         " commands of the grid for errors, Welch's for returns. They describe one policy; another seed may differ by more."
         " A * marks differences whose interval excludes 0. A single command or episode has no interval."
     )
@@ -290,7 +290,7 @@ def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Ta
 
 
 def _text(measured: Measured, form: str, factor: float) -> str:
-    """Return a figure with its interval in brackets."""
+    """Return a figure as text, with its interval in brackets."""
     if measured is None:
         return "-"
     value, interval = measured
@@ -311,7 +311,7 @@ def _figure(found: Counted) -> Measured:
 
 
 def _difference(first: Counted, second: Counted) -> Measured:
-    """Return the difference second - first; of errors, that over the commands of both."""
+    """Return `second` - `first` with its interval. Errors are compared over the commands that both have."""
     match first, second:
         case dict(), dict():
             moved = {command: second[command] - error for command, error in first.items() if command in second}
@@ -324,7 +324,7 @@ def _difference(first: Counted, second: Counted) -> Measured:
 
 
 def _errors(name: str, result: dict[str, Any]) -> Counted:
-    """Return an error by command; its mean from a file that lacks the cells."""
+    """Return command -> error; the mean error if the file lacks the cells."""
     tracking = tracking_of(result)
     try:
         cells = {tuple(cell["command"]): float(cell[name]) for cell in tracking["cells"] if cell[name] is not None}
@@ -339,8 +339,8 @@ def _failures(result: dict[str, Any]) -> Counted:
 
 
 def _returns(result: dict[str, Any]) -> Counted:
-    """Return mean and sample standard deviation of returns, and the number of episodes. The file holds the population's
-    standard deviation, which is a little smaller.
+    """Return mean and sample standard deviation of returns, and the number of episodes. The sample standard deviation is
+    computed from the population's, which the file holds.
     """
     count = int(value_at(result, "episodes.count") or 0)
     if count < 1:

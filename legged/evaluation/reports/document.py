@@ -1,4 +1,4 @@
-"""Pages in parts: written as one HTML file that needs no other, or as Markdown with its pictures in their own files."""
+"""Pages that consist of parts, written as one self-contained HTML file, and as Markdown with pictures in separate files."""
 
 import base64
 import math
@@ -13,7 +13,7 @@ from legged.process.paths import write_text
 from legged.tables import markdown_table
 
 SHORT = 32
-"""Letters of a cell that stay on one line."""
+"""Number of letters of a cell that are kept on one line."""
 KINDS = {".gif": "image/gif", ".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp", ".mp4": "video/mp4"}
 
 
@@ -24,14 +24,14 @@ class Mono(str):
 
 
 class Link(NamedTuple):
-    """A text that leads to another file."""
+    """A text that is a link to another file."""
 
     text: str
     href: str
 
 
 class Number(NamedTuple):
-    """A number: its text, and the value that it is sorted by."""
+    """A number: the text that is shown, and the value by which rows are sorted."""
 
     text: str
     value: float | None
@@ -47,14 +47,14 @@ class Heading(NamedTuple):
 
 
 class Paragraph(NamedTuple):
-    """Sentences, with code between backticks; a short `badge` may stand before them."""
+    """Sentences with code between backticks, and optionally a short `badge` before them."""
 
     text: str
     badge: str = ""
 
 
 class Table(NamedTuple):
-    """Rows under a head; a `wide` table can be sorted by its columns and filtered by words."""
+    """Rows under a head. In HTML a `wide` table can be sorted by its columns and filtered by words."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[Cell]]
@@ -67,7 +67,7 @@ class Table(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """Drawings (SVG), side by side where there is room; in Markdown one file of that `name`."""
+    """Drawings (SVG), side by side where there is room; for Markdown they are one file called `name`."""
 
     name: str
     drawings: Sequence[str]
@@ -87,12 +87,12 @@ class Picture(NamedTuple):
 
     @property
     def data(self) -> str:
-        """The file as an address that holds all of it."""
+        """The file's contents as a data URL."""
         return f"data:{self.mime};base64,{base64.b64encode(self.path.read_bytes()).decode('ascii')}"
 
 
 class Listing(NamedTuple):
-    """Lines of a program or a difference, folded up in a page; Markdown names their `file`."""
+    """Lines of a program or a diff. They are folded up in HTML; Markdown names their `file` instead."""
 
     title: str
     text: str
@@ -103,17 +103,17 @@ Part = Heading | Paragraph | Table | Figures | Picture | Listing
 
 
 def number(value: float | None, form: str = ".3f") -> Number:
-    """Return a number as a cell; a dash, which is not sorted, for None and for values that are not finite."""
+    """Return a number as a cell; a dash, which is sorted last, for None and for values that are not finite."""
     return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}", value)
 
 
 def between(interval: tuple[float, float], factor: float = 1.0, form: str = ".1f") -> str:
-    """Return an interval as text."""
+    """Return an interval as text: '1.0 to 2.0'."""
     return f"{factor * interval[0]:{form}} to {factor * interval[1]:{form}}"
 
 
 def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
-    """Write a page as <stem>.html and as <stem>.md, with its drawings as <stem>_<name>.svg; return the path of the first.
+    """Write a page as <stem>.html and <stem>.md, and its drawings as <stem>_<name>.svg; return the path of the HTML file.
 
     Raises:
         RunError: a file can't be written.
@@ -131,13 +131,13 @@ def write_pages(stem: Path, title: str, parts: Sequence[Part]) -> Path:
 
 
 def to_html(title: str, parts: Sequence[Part]) -> str:
-    """Return a whole page, which holds its pictures too."""
+    """Return a whole HTML page, which contains its pictures."""
     kinds = {"kind_of": lambda one: type(one).__name__, "pieces": _pieces, "SHORT": SHORT}
     return render("document.html", title=title, parts=parts, **kinds)
 
 
 def _pieces(text: str) -> list[str]:
-    """Split sentences: every second piece is code between backticks."""
+    """Split a text at its backticks; every second piece is code."""
     return re.split(r"(`[^`]+`)", text)
 
 
@@ -179,8 +179,8 @@ def text_of(cell: Cell) -> str:
 
 
 def _room(head: str, cells: Sequence[Cell]) -> str:
-    """Return non-breaking spaces that keep a column of texts readable: viewers of Markdown squeeze the texts of a table that
-    is wider than the page to one word per line, but not below the width of their head. Two spaces are as wide as a letter.
+    """Return non-breaking spaces that widen the head of a column of texts. If a table is wider than the page, viewers of
+    Markdown break texts after every word, but keep a column as wide as its head. Two spaces are as wide as a letter.
     """
     longest = max((len(text) for text in map(text_of, cells) if " " in text), default=0)
     return "&nbsp;" * (2 * (min(longest, SHORT) - len(head)))
@@ -195,7 +195,7 @@ def _markdown_cell(cell: Cell) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text on one line that is escaped for Markdown; tables escape their bars too."""
+    """Return a text on one line, escaped for Markdown. In tables vertical bars are escaped too, by `markdown_table`."""
     return _escaped(" ".join(text.split()))
 
 

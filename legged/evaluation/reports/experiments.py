@@ -1,4 +1,4 @@
-"""All runs in one table, newest first; the seeds of one training may share a row."""
+"""The page of experiments: all runs in one table, newest first. Runs that differ only in their seed may share a row."""
 
 import itertools
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ from legged.evaluation.success import types_in
 
 TITLE = "Experiments"
 EMPTY = ("", "-")
-"""Texts of empty cells; a column of empty cells is left out."""
+"""Texts of empty cells. A column with only empty cells is left out."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
-"""Share of robots above which stairs count as crossed."""
+"""Least share of robots that have to cross stairs for the stairs to count as crossed."""
 
 
 def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seeds_share: bool = False) -> list[Part]:
-    """Return the page on some runs. Runs below the folder `beside`, where the page is written, link to their reports with
-    that `ending`. With `seeds_share`, runs that differ only in their seed share a row, with means.
+    """Return the parts of a page on some runs, which will be written to the folder `beside`. Runs in that folder are linked
+    to their reports, report.<ending>. With `seeds_share`, runs that differ only in their seed share a row, with means.
     """
     newest = sorted(records, key=lambda record: (record.began, record.name), reverse=True)
     groups: dict[str, list[Record]] = {}
@@ -41,14 +41,14 @@ def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seed
         " training, with noise and pushes. A + marks a commit with uncommitted changes."
     )
     if "evaluated" in shown:
-        text += " The column `evaluated` names the checkpoint of an evaluation that is not of the last one."
+        text += " The column `evaluated` names the checkpoint that was evaluated if it is not the last one."
     if len(rows) < len(newest):
         text += " Runs that differ only in their seed share a row, with their means."
     return [Paragraph(text), Table(shown, [[row[name] for name in shown] for row in rows], wide=True)]
 
 
 def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str, Cell]:
-    """Return the row of runs that differ in their seeds, or of a single one, by column."""
+    """Return column -> cell, for a single run or for runs that differ only in their seeds."""
     rows = [_row(record, beside, ending) for record in group]
     if len(rows) == 1:
         return rows[0]
@@ -64,7 +64,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return the row of a run, by column; figures of evaluations are those in the first engine of ENGINES that has one."""
+    """Return column -> cell for a run. Evaluated figures are those in the first engine of ENGINES with an evaluation."""
     timing = record.timing
     judged = next(iter(record.results.values()), {})
     return {
@@ -83,8 +83,8 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
 
 
 def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | None, str]]:
-    """Return the figures that are averaged in a row of several seeds, each with its format: those of the evaluation `judged`,
-    the last ones of the training, and its times.
+    """Return column -> figure and its format, for the figures that are averaged over seeds: those of the evaluation `judged`,
+    those at the end of the training, and the training's times.
     """
     timing, tracking = record.timing, tracking_of(judged)
     return {
@@ -104,8 +104,8 @@ def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | 
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest steps that robots crossed up and down, as they did all lower steps [m]; 0 if they did
-    not cross the lowest; None without an evaluation both ways.
+    """Return the height of the highest steps [m] such that robots crossed these and all lower steps, both up and down.
+    Return 0 if robots did not cross the lowest steps, and None without evaluations in both directions.
     """
     points = [types_in(result).get(name, {}).get("points", []) for name in STAIRS]
     ways = [{point["size"]: point["share"] for point in of_type} for of_type in points]
@@ -115,7 +115,7 @@ def highest_stairs(result: dict[str, Any]) -> float | None:
 
 
 def _began(record: Record, beside: Path, ending: str) -> Cell:
-    """Return the time at which a run began, as a link to its report if that lies below `beside`."""
+    """Return the time at which a run began. It is a link to the run's report if the report lies in the folder `beside`."""
     text, report = f"{record.began:%Y-%m-%d %H:%M}", (record.folder / f"{REPORT}.{ending}").resolve()
     if report.is_file() and report.is_relative_to(beside.resolve()):
         return Link(text, report.relative_to(beside.resolve()).as_posix())
@@ -123,5 +123,5 @@ def _began(record: Record, beside: Path, ending: str) -> Cell:
 
 
 def _last(record: Record, tag: str) -> float | None:
-    """Return the last value of a curve, as a running mean."""
+    """Return the running mean of a curve at its end; None if the curve was not logged."""
     return float(smooth(record.scalars[tag][1])[-1]) if tag in record.scalars else None

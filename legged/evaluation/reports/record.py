@@ -1,4 +1,4 @@
-"""The contents of a run folder, read for a report; damaged or missing parts are left out and named."""
+"""The contents of a run folder, read for a report. Parts that cannot be read are left out, and the reasons are kept."""
 
 import os
 import re
@@ -24,18 +24,18 @@ from legged.learning.timing import Timing, read_timing
 from legged.registry import task_config
 
 FILMS = ("film.gif", "play.gif", "play.mp4")
-"""Films of the policy; the first that exists is shown."""
+"""Names of the policy's films; the first film that exists is shown."""
 NAMES = ("train.runner.run_name", "train.runner.experiment_name", "train.runner.report", "train.runner.film", "task")
 """Settings that do not affect the policy."""
 MOST_WORDS = 4
-"""Most settings that a summary names."""
+"""Largest number of settings that a summary names."""
 LONGEST_VALUE = 60
 DEEPEST = 3
-"""Levels of folders in which runs are searched: logs, tasks, runs."""
+"""Number of levels of folders that are searched for runs: logs, tasks, runs."""
 QUIET_S = 3600.0
-"""A training that has written nothing for this long has ended, even if a process with its number exists [s]."""
+"""Time without new output after which a training counts as ended, even if a process with its id exists [s]."""
 QUIET_ELSEWHERE_S = 120.0
-"""The same for a training on another machine [s]."""
+"""Time without new output after which a training on another machine counts as ended [s]."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class Code:
 
     version: str = ""
     commit: str = ""
-    """Full hash; empty if not known."""
+    """Full hash of the commit; empty if it is not known."""
     files: int = 0
-    """Files that differ from the commit."""
+    """Number of files that differ from the commit."""
     added: int = 0
     removed: int = 0
     text: str = ""
-    """The whole text of the file."""
+    """The whole text of CODE_FILE."""
 
     @property
     def summary(self) -> str:
-        """The short commit and the size of its difference."""
+        """The commit's short hash, and the number of files and lines that differ from the commit."""
         if not self.commit:
             return "not known"
         changed = f", {self.files} file{'s' * (self.files > 1)} changed, +{self.added} -{self.removed}" if self.files else ""
@@ -63,16 +63,16 @@ class Code:
 
 @dataclass(frozen=True)
 class Record:
-    """A run, as its folder describes it."""
+    """What the folder of a run says about the run."""
 
     folder: Path
     config: dict[str, Any]
-    """The resolved configuration. Its names are those of this version, if this version can read it."""
+    """The resolved configuration, with the field names of this version if this version can read the file."""
     began: datetime
     timing: Timing | None
     scalars: Scalars
     results: dict[str, dict[str, Any]]
-    """Engine -> its evaluation, in the order of ENGINES."""
+    """Name of an engine -> the run's evaluation in it, in the order of ENGINES."""
     code: Code
     note: str
     """Note of the user."""
@@ -81,7 +81,7 @@ class Record:
     why: str
     """Details of the status."""
     done: int
-    """Iterations of the last policy or log, including those before a resumption."""
+    """Number of iterations at the last checkpoint or log entry, including iterations before a resumption."""
     problems: tuple[str, ...]
     """Reasons why parts could not be read."""
     given: Invocation | None = None
@@ -98,7 +98,7 @@ class Record:
 
     @property
     def name(self) -> str:
-        """Name of the folder, after that of its experiment."""
+        """Name of the experiment's folder and of the run's folder: 'anymal_c_flat/2026-01-31_12-00-00'."""
         return "/".join(self.folder.resolve().parts[-2:])
 
     @property
@@ -115,7 +115,7 @@ class Record:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Settings of its command line, as far as they are known."""
+        """Settings on the run's command line; empty if the command line was not stored."""
         return {} if self.given is None else dict(self.given.changes)
 
     @property
@@ -124,8 +124,8 @@ class Record:
         return Log(self.scalars, self.config)
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
-        """Return the checkpoint of an evaluation; an empty text if it is the last checkpoint, which all other figures
-        describe.
+        """Return the name of the evaluated checkpoint; an empty text if it is the run's last checkpoint, which all other
+        figures describe.
         """
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
@@ -148,14 +148,14 @@ def read_record(folder: Path) -> Record:
     """Read a run folder.
 
     Raises:
-        ConfigError: the folder is no run folder.
+        ConfigError: the folder is not a run folder.
     """
     if not (folder / CONFIG_FILE).is_file():
         raise ConfigError(f"{folder}: is no run folder (it has no {CONFIG_FILE})")
     problems: list[str] = []
 
     def known(read: Callable[[Path], Any], path: Path = folder, otherwise: Any = None) -> Any:
-        """Return what `read` finds; note why it fails, and return `otherwise` then."""
+        """Return the result of `read`. If `read` fails, add the reason to the problems and return `otherwise`."""
         try:
             return read(path)
         except (ConfigError, OSError, ValueError) as error:
@@ -178,14 +178,14 @@ def read_record(folder: Path) -> Record:
 
 
 def _began(folder: Path) -> datetime:
-    """Return the start of a run, from the beginning of its folder's name, else from its configuration's file."""
+    """Return the time at which a run began: the time in the folder's name, else the configuration file's last change."""
     with suppress(ValueError):
         return datetime.strptime(folder.resolve().name[:19], "%Y-%m-%d_%H-%M-%S")
     return datetime.fromtimestamp((folder / CONFIG_FILE).stat().st_mtime)
 
 
 def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: int) -> tuple[str, str]:
-    """Return the status of a run, and its details."""
+    """Return the status of a run, and the details of the status."""
     of = f"{done:,} of {until:,} iterations" if isinstance(until, int) else f"{done:,} iterations"
     if timing is not None:
         if timing.finished:
@@ -196,16 +196,15 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
     if (folder / "model.pt").is_file():
         return "finished", "a policy that comes with this package"
     if isinstance(until, int) and saved >= until:
-        return "finished", f"{of}; it says nothing of its times"
+        return "finished", f"{of}; the run folder holds no times"
     if is_running(folder):
         return "running", f"{of} so far"
-    return "killed", f"after {of}: no end was written, so its process was killed or could not write any more"
+    return "killed", f"after {of}: no end was written, so the process was killed or could no longer write"
 
 
 def is_running(folder: Path) -> bool:
-    """Return whether the process that writes a run's log is alive. The log's name
-    (events.out.tfevents.<time>.<host>.<process>.<file>) holds its number on this machine; on another machine the time of its
-    last write counts.
+    """Return whether the process that writes a run's log is alive. On this machine the process is looked up by its id in the
+    log's name (events.out.tfevents.<time>.<host>.<process>.<file>); for another machine the log's last change counts.
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
@@ -221,7 +220,7 @@ def is_running(folder: Path) -> bool:
 
 
 def read_code(folder: Path) -> Code:
-    """Read the version, the commit and the difference that a run was made with."""
+    """Read the version, the commit and the uncommitted changes that a run was made with."""
     try:
         text = (folder / CODE_FILE).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -235,7 +234,7 @@ def read_code(folder: Path) -> Code:
 
 
 def read_note(folder: Path) -> str:
-    """Read the note of a run, on one line."""
+    """Return the note of a run as one line; an empty text without a note."""
     with suppress(OSError):
         return " ".join((folder / NOTE_FILE).read_text(encoding="utf-8", errors="replace").split())
     return ""
@@ -245,8 +244,8 @@ def read_note(folder: Path) -> str:
 
 
 def from_task_file(record: Record) -> dict[str, list[Any]] | None:
-    """Return the settings in which a run differs from its task's files, each with both values; None if there is no such task.
-    A run without a known device is compared with the nearer of the settings for a CPU and for a GPU.
+    """Return setting -> the run's value and the value in the task's files, for settings that differ; None if there is no such
+    task. If the run's device is not known, the task's settings for CPU or for GPU are taken, whichever differ less.
     """
     where = [record.timing.device == "cpu"] if record.timing else [False, True]
     try:
@@ -257,7 +256,7 @@ def from_task_file(record: Record) -> dict[str, list[Any]] | None:
 
 
 def words(value: Any) -> str:
-    """Return a value as in a YAML file, on one line; a dash for a missing one."""
+    """Return a value as one line of YAML, shortened if it is long; a dash for a missing value."""
     if value is MISSING:
         return "-"
     text = dump(value, default_flow_style=True, width=1_000_000).strip().removesuffix("...").strip()
@@ -265,8 +264,8 @@ def words(value: Any) -> str:
 
 
 def what_changed(record: Record, named: bool = True) -> str:
-    """Return a summary of a run: its note, else its name (if `named`) and the settings that differ from its task's; for an
-    unknown task, the settings of its command line.
+    """Return a summary of a run: its note or, without a note, its name (if `named`) and the settings that differ from those
+    of the task. If the task is unknown, the settings are those of the command line.
     """
     if record.note:
         return record.note

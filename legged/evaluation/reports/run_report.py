@@ -1,4 +1,4 @@
-"""The report on one run: report.html, which needs no other file, and report.md with its pictures."""
+"""The report on one run: report.html, which is self-contained, and report.md with its pictures."""
 
 import os
 import shlex
@@ -45,22 +45,22 @@ from legged.process.processes import child_environment
 REPORT = "report"
 """Name of the report's files, before their ending."""
 ROWS = 10
-"""Rows of the table over training."""
+"""Number of rows of the table over the training."""
 LARGEST_FILM = 12 * 2**20
-"""A larger film is named, not shown [bytes]."""
+"""Largest film that is shown in the report; of a larger film the report gives the name [bytes]."""
 LOG = "film.log"
-"""File in a run folder with the output of the process that films the policy."""
+"""Name of the file in a run folder with the output of the process that films the policy."""
 NICENESS = 10
 FILMING: list[subprocess.Popen] = []
 """Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
-"""Largest number of letters of a code difference in the page; its file holds the whole text."""
+"""Largest number of letters of a code diff in the page; CODE_FILE holds the whole diff."""
 ON_GRID = (
     "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
     " interval of falls is Wilson's. A cell of the maps is the mean over the third command."
 )
 ON_TERRAIN = (
-    "Robots that get out of a tile of each size, with Wilson's interval of 95 %; a dotted line is the hardest of training."
+    "Robots that get out of a tile of each size, with Wilson's 95 % interval. A dotted line marks the hardest of training."
 )
 OVER_TRAINING = {
     "Train/mean_reward": ("return", 1.0, ".2f"),
@@ -71,14 +71,14 @@ OVER_TRAINING = {
     "Metrics/episode_length": ("episode [steps]", 1.0, ".0f"),
     "Terrain/level": ("terrain level", 1.0, ".2f"),
 }
-"""Tag -> head, factor and form of the columns of the table over training."""
+"""Tag -> heading, factor and number format of a column of the table over the training."""
 
 
 def write_report(folder: Path) -> Path:
-    """Write report.html, report.md and its pictures into a run folder; return the page.
+    """Write report.html, report.md and its pictures into a run folder; return the path of report.html.
 
     Raises:
-        ConfigError: the folder is no run folder.
+        ConfigError: the folder is not a run folder.
         RunError: a file can't be written.
     """
     record = read_record(folder)
@@ -109,13 +109,13 @@ def report_parts(record: Record) -> list[Part]:
 
 
 def command_on(record: Record, command: str) -> str:
-    """Return a command on a run, quoted for a shell, with the option that names its user-defined task."""
+    """Return the shell command `legged COMMAND RUN`, with the option that names the folder of a user-defined task."""
     given = Invocation(record.task) if record.given is None else record.given
     return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return the facts about a run, one on each line."""
+    """Return rows (name, text) with facts about a run."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
@@ -149,7 +149,7 @@ def _facts(record: Record) -> list[list[Cell]]:
 
 
 def _film(record: Record) -> list[Part]:
-    """Return the first film of the policy that exists, if it is small enough."""
+    """Return the first film of the policy that exists, or a sentence that names the film if it is too large to show."""
     for film in (record.folder / name for name in FILMS):
         with suppress(OSError):
             size = film.stat().st_size
@@ -174,7 +174,7 @@ def _differences(record: Record) -> list[Part]:
 
 
 def over_training(record: Record) -> Table:
-    """Return about ten rows over a training: steps, time, returns, errors."""
+    """Return a table with about ROWS iterations of a training: steps, time, returns, errors."""
     scalars = record.scalars
     columns = {tag: column for tag, column in OVER_TRAINING.items() if tag in scalars}
     steps = np.unique(np.concatenate([scalars[tag][0] for tag in columns or [next(iter(scalars))]]))
@@ -187,7 +187,7 @@ def over_training(record: Record) -> Table:
     for step in picked:
         count = None if per_iteration is None else float((step + 1) * per_iteration)
         row: list[Cell] = [Number(f"{step + 1:,d}", float(step + 1)), number(count, ",.0f")]
-        for iterations, values, form in drawn:  # the last value up to this iteration
+        for iterations, values, form in drawn:  # take the last value up to this iteration
             before = values[iterations <= step]
             row.append(number(float(before[-1]) if len(before) else None, form))
         rows.append(row)
@@ -199,7 +199,7 @@ def over_training(record: Record) -> Table:
 
 
 def _evaluations(record: Record) -> list[Part]:
-    """Return the part on evaluations, by engine: tables, heat maps over commands, success over difficulty, returns."""
+    """Return the parts on evaluations in all engines: tables, heat maps over commands, success over difficulty, returns."""
     parts: list[Part] = [Heading("Evaluation")]
     if not record.results:
         return [*parts, Paragraph(f"None yet: `{command_on(record, 'evaluate')}`")]
@@ -230,7 +230,7 @@ def _evaluations(record: Record) -> list[Part]:
 
 
 def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
-    """Return maps of errors over commands; none if the file lacks the cells."""
+    """Return heat maps (SVG) of errors over commands; an empty list if the file lacks the cells."""
     try:
         grid, found = tracking["grid"], []
         for name, over, other, title in PANELS:
@@ -243,7 +243,7 @@ def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
 
 
 def _episodes(label: str, episodes: dict[str, Any]) -> list[Part]:
-    """Return a table of full episodes."""
+    """Return a sentence and a table on an evaluation by full episodes."""
     rows: list[list[Cell]] = []
     for measure, key in (("return", "return"), ("length [control steps]", "length")):
         rows.append([measure, *(number(episodes[key][part], ".1f") for part in ("mean", "std", "min", "max"))])
@@ -261,12 +261,12 @@ def _episodes(label: str, episodes: dict[str, Any]) -> list[Part]:
 
 
 def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
-    """Write the report on a run that has just ended, and print its path. Every failure is one printed line, because the run
-    itself is complete.
+    """Write the report on a run that has just ended, and print its path. A failure prints one line and raises no error,
+    because the run itself is complete.
 
-    `film_with` holds the options by which another process finds the run's task. That process films the policy and writes the
-    report again with the film. Nothing waits for it: it outlives this process, and LOG in the run folder keeps its output.
-    The film has its own process because a graphics driver that fails may end the process, or hang.
+    If `film_with` is given, a second process films the policy and writes the report again with the film. `film_with` holds
+    the options with which that process finds the run's task. This process does not wait for it; LOG in the run folder keeps
+    its output. The film has its own process because a graphics driver that fails may end the process or hang.
     """
     start = time.perf_counter()
     try:
@@ -274,7 +274,7 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
         film = "" if film_with is None else f"; {_film_apart(folder, film_with)}"
     except KeyboardInterrupt:
         print(f"{relative(folder)}: interrupted before its report was written", file=sys.stderr, flush=True)
-    except Exception as error:  # a report must not spoil a run
+    except Exception as error:  # a report that fails must not make the run fail
         said = " ".join(str(error).split())[:300] or type(error).__name__
         print(f"warning: {relative(folder)}: no report: {said}", file=sys.stderr, flush=True)
     else:
@@ -282,13 +282,13 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
 
 
 def _film_apart(folder: Path, options: Sequence[str]) -> str:
-    """Start another process that films the policy; return a few words about it."""
+    """Start another process that films the policy; return words about the film for the printed line."""
     if headless.NO_PICTURES:
         return "no film: nothing can be drawn"
     command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *options]
     alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
     alone["CUDA_VISIBLE_DEVICES"] = ""  # the film is drawn on the CPU, because a GPU's memory may be full
-    alone["LP_NUM_THREADS"] = "1"  # threads of Mesa, which draws without a GPU
+    alone["LP_NUM_THREADS"] = "1"  # number of threads of Mesa, which draws without a GPU
     FILMING[:] = [process for process in FILMING if process.poll() is None]
     try:
         with (folder / LOG).open("wb") as log:

@@ -1,5 +1,5 @@
-"""The disturbances of the stress test: their table, for a robot of any size, and a task with a different disturbance for each
-robot, all in one simulation.
+"""The disturbances of the stress test: their table, which is scaled to the robot's size, and a task in which each robot has
+another disturbance.
 """
 
 from collections.abc import Sequence
@@ -28,32 +28,29 @@ PUSH_INTERVAL = 5.0
 
 
 def _told(text: str, unit: str = "", default: float | None = 0.0) -> Any:
-    """Return a field of a disturbance: the text of its number, and the unit of a number that scales with the robot; delays,
-    angles and shares do not scale.
+    """Return a dataclass field with the `text` that describes its number. With a `unit` the number scales with the robot;
+    delays, angles and shares do not scale.
     """
     return field(default=default, metadata={"text": text, "unit": unit})
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbances of one robot, its sensors and its motors, constant over time. "Either way" means the number or its
-    opposite.
-    """
+    """Disturbances of one robot, its sensors and its motors, constant over time. "Either way" means with either sign."""
 
     name: str
     payload: float = _told("{:g} kg on the base", "kg")
     """Mass added to the base, at its centre of mass [kg]."""
     friction: float | None = _told("friction {:g}", default=None)
-    """Sliding friction of all contacts of the robot, in place of its nominal one [1]."""
+    """Sliding friction of all contacts of the robot; None keeps the nominal friction [1]."""
     motors: float = _told("motors at {:.0%}", default=1.0)
     """Factor on the torque of every motor and on its limit [1]."""
     delay: float = _told("targets {:g} s late")
     """Delay of the targets on the way to the motors [s]."""
     push: float = _told(f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s", "m/s")
-    """Every PUSH_INTERVAL the base's velocity along the world's x and y is set to random values up to this, either way [m/s].
-    """
+    """Largest velocity, either way, to which the base is set along the world's x and y every PUSH_INTERVAL [m/s]."""
     zero_offset: float = _told("encoders up to {:g} rad off")
-    """Largest random error of the encoders, either way; policy and motors both use the wrong angle [rad]."""
+    """Largest random error of the encoders, either way [rad]. Both policy and motors use the wrong angle."""
     tilt: float = _told("inertial sensor askew by {:g} rad")
     """Tilt of the inertial sensor about a random horizontal axis [rad]."""
     map_height: float = _told("height map {:g} m too high or low", "m")
@@ -61,11 +58,11 @@ class Disturbance:
     map_shift: float = _told("height map shifted by {:g} m", "m")
     """Horizontal error of the height map, in a random direction [m]."""
     map_holes: float = _told("{:.0%} of the height map missing")
-    """Share of the points of the height map that are missing and read 0, like level ground [1]."""
+    """Share of the points of the height map that are missing [1]. They read 0, like level ground."""
 
     @property
     def changes(self) -> dict[str, float]:
-        """Return name -> number of the fields that differ from their defaults."""
+        """Return name of a field -> number, for the fields that differ from their defaults."""
         return {one.name: getattr(self, one.name) for one in fields(self)[1:] if getattr(self, one.name) != one.default}
 
     @property
@@ -76,9 +73,9 @@ class Disturbance:
 
 
 GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
-"""Properties (domain_rand.ranges) that rows set."""
+"""Properties of domain_rand.ranges that the lines of the table set."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
-"""Disturbances whose largest value the configuration holds."""
+"""Disturbances whose largest value over all robots is written into the task's configuration."""
 NOMINAL = Disturbance("nominal")
 ALONE = (
     Disturbance("payload", payload=8.0),
@@ -93,19 +90,19 @@ ALONE = (
     Disturbance("map holes", map_holes=0.2),
     Disturbance("no map", map_holes=1.0),
 )
-"""Single disturbances, for an ANYmal C."""
+"""Single disturbances, with numbers for an ANYmal C."""
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
-"""Disturbances of the line `together`: common differences of hardware."""
+"""Disturbances of the line `together`, which are common on hardware."""
 WORST = ("delay 40 ms", "no map")
-"""Disturbances that the line `everything` lacks, because it has a smaller one of the same kind."""
+"""Disturbances that are not part of the line `everything`, which has a smaller one of the same kind."""
 
 NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
 """Names of all lines."""
 
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
-    """Return all lines for a robot of that size: no disturbance, each alone, some together, all. `anymal` is the size of the
-    robot for which the numbers are written; scaled numbers have two digits. A `payload` [kg] replaces that of the table.
+    """Return all lines of the table for a robot of the size `robot`: no disturbance, each alone, TOGETHER, and everything.
+    Numbers are scaled from the size `anymal` and rounded to two digits. A `payload` [kg] replaces that of the table.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:
@@ -126,7 +123,7 @@ def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
 
 
 def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
-    """Return the disturbances of all `parts`, which have no field in common."""
+    """Return one disturbance called `name` with the fields of all `parts`, which have no field in common."""
     return Disturbance(name, **{key: value for part in parts for key, value in part.changes.items()})
 
 
@@ -134,7 +131,7 @@ def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
 
 
 def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
-    """Return overrides that enable these disturbances in a task. Each robot gets the values of its row once the task is
+    """Return overrides that enable the disturbances of all `rows` in a task. Each robot gets its own values when the task is
     built.
     """
     given = {"friction": True, "added_base_mass": True}
@@ -155,7 +152,7 @@ def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
 
 
 def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]]:
-    """Return overrides that make the delay buffer of a task long enough for these robots, each with a constant delay."""
+    """Return overrides that make the delay buffer of a task long enough for all `rows` and keep each delay constant."""
     most = max(cfg.control.actuator.delay[1], *(round(row.delay / cfg.sim.dt) for row in rows))
     return [("control.actuator.delay", [most] * 2), ("control.actuator.delay_varies", False)] if most else []
 
@@ -167,12 +164,12 @@ def make_stressed(
     kind: Any = task_class(cfg.task)
     own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
     stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
-    other_ground = {} if terrain is None else {"terrain": terrain}  # a user's constructor may not know the argument
+    other_ground = {} if terrain is None else {"terrain": terrain}  # a user-defined task may not accept the argument
     return stressed(override(cfg, late(rows, cfg)), device, graph, **other_ground)  # type: ignore[no-any-return]
 
 
 class GivenMap(HeightMapErrors):
-    """A height map with given errors, the same in every episode."""
+    """Errors of a height map that are given instead of drawn, and are the same in every episode."""
 
     given: tuple[Tensor, Tensor]
     """Values of `error` and `holes`."""
@@ -183,17 +180,17 @@ class GivenMap(HeightMapErrors):
 
 
 class StressedTask(LeggedRobot):
-    """A mix-in before a task's class that gives each robot the disturbance of its row. A separate generator draws their
-    random numbers once, so the task's own random numbers stay the same.
+    """A mix-in before a task's class that gives each robot the disturbance of its row. The random numbers of disturbances are
+    drawn once, by a separate generator, so the task's own random numbers stay the same.
     """
 
     rows: tuple[Disturbance, ...] = ()
     """Disturbance of each of the N robots."""
     own_delay: tuple[int, int] = (0, 0)
-    """Range of the delay, in physics steps, of robots whose row has none: the task's."""
+    """The task's range of delays [physics steps], for robots whose row has no delay."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Build the task, then give the physics the constant properties of each robot."""
+        """Build the task, then set the disturbed properties of each robot in the control and in the physics."""
         super().__init__(*args, **kwargs)
         given = {"added_base_mass": self._per_robot("payload"), "motor_strength": self._per_robot("motors")}
         given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
@@ -213,7 +210,7 @@ class StressedTask(LeggedRobot):
         return self._scene
 
     def _frictions(self) -> Tensor:
-        """Return the friction of each robot, (N,), or of each of its shapes if they differ nominally, (N, shapes)."""
+        """Return the friction of each robot (N,), or of each shape (N, shapes) if shapes differ in their nominal friction."""
         model = self.physics.model
         own = [float(value) for value in model.geom_friction[FIELDS["friction"].rows(self._scene, model), 0]]
         shapes = own[:1] if len(set(own)) == 1 else own
@@ -226,7 +223,7 @@ class StressedTask(LeggedRobot):
         random = torch.Generator().manual_seed(self.cfg.env.seed)
 
         def draw(*shape: int) -> Tensor:
-            """Return U(-1, 1), the same on every device."""
+            """Return uniform random numbers from -1 to 1, (N, *shape), which are the same on every device."""
             return (2.0 * torch.rand(n, *shape, generator=random) - 1.0).to(device)
 
         self._pushed = self._per_robot("push") > 0.0
@@ -249,7 +246,7 @@ class StressedTask(LeggedRobot):
             self.control.actuator.delay.copy_(torch.where(steps > 0.0, steps, own))
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return a map with the errors of the rows, without those of the task."""
+        """Return a height map with the errors of each robot's row instead of the task's errors."""
         cfg, n = self.cfg.observations.height_map, self.num_envs
         if is_exact(cfg):
             return None

@@ -43,43 +43,43 @@ from legged.tables import screen_table
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 
 RISER = 0.17
-"""Height of the steps of the stairs, at scale 1 [m]."""
+"""Height of the stairs' steps at terrain.scale 1 [m]."""
 TREAD = 0.28
-"""Width of the steps, for a robot of any size: that of a house's stairs [m]."""
+"""Width of the stairs' steps for robots of all sizes, as in houses [m]."""
 STAIRS = ("stairs_up", "stairs_down")
-"""Half of the robots go up, the others down."""
+"""Terrain types of the stairs: half of the robots go up, half go down."""
 GROUND = {"dense_blocks": 0.25, "kerbs": 0.17, "rubble": 0.2}
-"""Type of ground that no task is trained on -> its size at scale 1 [m]."""
+"""Terrain type that no task is trained on -> its size at terrain.scale 1 [m]."""
 HOLD_S, SETTLE_S = 6.0, 1.0
-"""Time for which a command is held on the flat, and the time at its start that is not measured [s]."""
+"""Time for which a command is held on the flat, and time at the start of a command that is not measured [s]."""
 LIMIT = 0.25
-"""Largest root mean square error of the velocity of a robot that follows its command, at scale 1 [m/s]."""
+"""Largest RMS velocity error with which a robot counts as following its command, at terrain.scale 1 [m/s]."""
 COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate), as parts of the ends of the axes of the task's grid; they are given to the robots
-in turn."""
+"""Commands on the flat (vx, vy, yaw rate), as shares of the lowest or the highest value of a grid axis; robots get them in
+turn."""
 Changes = Sequence[tuple[str, Any]]
 """Overrides of a configuration."""
 HALF_STEP = "half the time step"
-"""Name of the setting that LSTM actuators do not allow."""
+"""Name of the solver setting that is not possible with LSTM actuators."""
 COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "ground": "#E69F00"}
-"""Colours of bars, by their kind; those of Okabe and Ito."""
+"""Kind of a bar -> its colour, from the palette of Okabe and Ito."""
 LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
 COMBINED = ("together", "everything")
 SETTING_LINES = ("nominal", "together")
-"""Lines of the table that are measured with each setting of the solver without `full`."""
+"""Lines of the table that are measured with each solver setting; `full` measures all lines."""
 
 
 def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
-    """Return name -> overrides of the solver settings to try, besides the task's own, that engine and motors allow."""
+    """Return name of a solver setting -> overrides, for all settings to try that the engine and the motors allow."""
     found: dict[str, list[tuple[str, Any]]] = {}
     network = cfg.control.actuator.network
-    # An LSTM of the motors advances with every step of the length that it was trained with.
+    # An LSTM that models motors has learned one length of the physics step, so the step cannot be halved.
     if not network or NetworkWeights.load(network).kind != "lstm":
         found[HALF_STEP] = [("sim.dt", 0.5 * cfg.sim.dt), ("control.decimation", 2 * cfg.control.decimation)]
-        if cfg.control.actuator.delay[1]:  # in physics steps
+        if cfg.control.actuator.delay[1]:  # the delay is given in physics steps
             found[HALF_STEP] += [("control.actuator.delay", [2 * steps for steps in cfg.control.actuator.delay])]
     if engine in ("mujoco", "mujoco_warp", "newton_mujoco"):
         found["elliptic cones"] = [("sim.cone", "elliptic")]
@@ -95,11 +95,11 @@ def check_asked(changes: Changes) -> None:
         for name in names if key.startswith(ranges) else ():
             if name in GIVEN:
                 where = f"command line: {ranges}.{name}"
-                raise ConfigError(f"{where}: legged evaluate stress sets it in each of its lines; leave it out")
+                raise ConfigError(f"{where}: legged evaluate stress sets this property itself; leave it out")
 
 
 class Bench:
-    """A policy on the test bench: builds tasks of stressed robots and measures them one after the other."""
+    """Test bench for a policy: it builds tasks with disturbed robots and measures them one after another."""
 
     def __init__(
         self,
@@ -110,9 +110,9 @@ class Bench:
         payload: float | None = None,
         lines: Sequence[str] = (),
     ) -> None:
-        """Take `robots` for each line of the table. `riser` and `tread` are the height and the width of the steps [m],
-        `payload` is the mass on the base [kg], and `lines` names the lines that are measured; by default RISER times the
-        scale, the table's mass, and all lines.
+        """Prepare a test with `robots` robots for each line of the table. `riser` (by default RISER times the scale) and
+        `tread` are the height and the width of the steps [m], `payload` (by default the table's) is the mass on the base
+        [kg], and `lines` (by default all) are the names of the lines to measure.
 
         Raises:
             ConfigError: the robot cannot be loaded, or an override randomises a property that the table sets.
@@ -126,15 +126,15 @@ class Bench:
         """The lines of the table that are measured."""
         self.scale = self.cfg.terrain.scale
         self.on_plane = self.cfg.terrain.mesh_type == "plane"
-        """True if the policy was trained on a plane; it is then measured on the flat only."""
+        """True if the policy was trained on a plane. Then it is measured on the flat only."""
         self.riser = round(RISER * self.scale, 3) if riser is None else riser
         self.limit = LIMIT * sqrt(self.scale)
-        """Largest error of a robot that follows its command [m/s]."""
+        """Largest RMS velocity error with which a robot counts as following its command [m/s]."""
         self.lost = 0
-        """Number of control steps in which a robot lost contacts because memory was full."""
+        """Number of pairs of a robot and a control step in which contacts were lost because memory was full."""
 
     def measure(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return the figures of some lines of the table; `changes` choose a solver."""
+        """Return the figures of the lines `rows` of the table. `changes` are overrides that choose a solver setting."""
         found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
         if not self.on_plane:
             for line, figures in zip(found, self.on_stairs(rows, changes), strict=True):
@@ -144,18 +144,18 @@ class Bench:
         return found
 
     def on_stairs(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return the success of each line; half of its robots go up, the others down."""
+        """Return the success on stairs for each line; half of the robots go up, half go down."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
         cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
         specs = [TileSpec(name, self.riser, self.tread) for name in STAIRS]
         outcomes, times = self._run_out(per_robot, specs, [cell, *changes])
-        # From the order (up or down, line, robot) to rows of lines.
+        # Robots are ordered by (up or down, line, robot). Reorder them to one row for each line.
         outcomes, times = (values.view(2, len(rows), half).transpose(0, 1).flatten(1) for values in (outcomes, times))
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
 
     def on_new_ground(self) -> dict[str, Any]:
-        """Return type -> the success of undisturbed robots on new ground."""
+        """Return terrain type -> the success of undisturbed robots, for the types in GROUND."""
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
         found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
@@ -166,7 +166,7 @@ class Bench:
         return ground
 
     def on_flat(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return the figures of each line's robots that follow commands on a plane."""
+        """Return for each line the figures of robots that follow commands on a plane."""
         per_robot = [row for row in rows for _ in range(self.robots)]
         ends = torch.tensor([[abs(axis[end]) for axis in axes_of(self.cfg).values()] for end in (0, -1)])
         parts = torch.tensor(COMMANDS)
@@ -185,16 +185,16 @@ class Bench:
     def _build(
         self, rows: Sequence[Disturbance], own: Changes, last: Changes, terrain: Terrain | None
     ) -> tuple[StressedTask, Policy]:
-        """Build a task and its policy. Overrides apply in the order `own`, the user's, `last`: another solver replaces the
-        user's.
+        """Build a task with one robot for each of `rows`, and its policy. The overrides `own` apply first, then the user's,
+        then `last`, so that a solver setting in `last` replaces the user's.
         """
-        gc.collect()  # the task before this one is in a reference cycle, and a GPU may not hold two
+        gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not hold two
         changes = [*own, *declared(rows), *self.setting.asked, *last]
         make = partial(make_stressed, rows)
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
     def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
-        """Return the outcomes (N,) of robots that are distributed over tiles, and their times [s]; `last` as for `_build`."""
+        """Let robots walk out of tiles of all `specs`; return outcomes (N,) and times (N,) [s]. `last`: see `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
@@ -203,8 +203,8 @@ class Bench:
         return scores.outcome.cpu(), scores.time_s.cpu()
 
     def _follow(self, task: StressedTask, act: Policy, commands: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the mean square error of each robot's velocity in its first episode (N,) [m^2/s^2], NaN for robots that fell
-        before the measurement began, and flags of those that fell (N,).
+        """Return the mean square error (N,) of each robot's velocity in its first episode [m^2/s^2], and flags (N,) of robots
+        that fell. The error is NaN for robots that fell before the measurement began.
         """
 
         def read(_: TensorDict) -> dict[str, Tensor]:
@@ -216,8 +216,8 @@ class Bench:
 
 
 def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
-    """Return the figures of robots (n,) on the flat, from the mean square errors of their velocities [m^2/s^2] and the flags
-    of those that fell. A robot follows its command if it stands and its error is at most `limit` [m/s].
+    """Return the figures of robots on the flat, from the mean square errors (n,) of their velocities [m^2/s^2] and the flags
+    (n,) of robots that fell. A robot succeeds if it did not fall and its RMS error is at most `limit` [m/s].
     """
     known = error[~error.isnan()]
     rmse = number_or_null(float(known.double().mean().sqrt())) if len(known) else None
@@ -225,8 +225,8 @@ def followed(error: Tensor, fell: Tensor, limit: float) -> dict[str, Any]:
 
 
 def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, Any]:
-    """Return the score: the mean of the shares of successful robots, over all lines of the table but the nominal one, on
-    stairs and on the flat, and over new ground; with its interval of 95 % and the means of the three parts.
+    """Return the score with its 95 % confidence interval, and the means of its three parts: stairs, flat and new ground. The
+    score is the mean of all shares of successful robots. The nominal line does not count.
     """
     disturbed = [line for line in lines if line["name"] != NOMINAL.name]
     parts = {name: [line[name] for line in disturbed if name in line] for name in ("stairs", "flat")}
@@ -241,9 +241,9 @@ def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, 
 
 
 def evaluate_stress(bench: Bench, full: bool) -> int:
-    """Run the stress test; with `full`, all lines with every setting of the solver. A bench with some lines leaves out new
-    ground and the score, and other solvers unless `full`. Print the result, then write stress_<physics>.json and .png. Return
-    the exit code.
+    """Run the stress test, print the result, write stress_<physics>.json and .png, and return the exit code. With `full` all
+    lines are measured with every solver setting. If the bench has only some of the lines, new ground and the score are left
+    out, and the solver settings too unless `full`.
 
     Raises:
         RunError: a file can't be written.
@@ -258,7 +258,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
     others = {}
     tried = settings(bench.cfg, engine) if full or bench.whole else {}
     if tried and HALF_STEP not in tried:
-        print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows its own alone", flush=True)
+        print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows one step only", flush=True)
     for name, changes in tried.items():
         print(f"{name}: {len(few)} lines", flush=True)
         others[name] = bench.measure(few, changes)
@@ -293,7 +293,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
 
 
 def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
-    """Return the rows of the table: kind (of COLORS), name, description, and figures of success and of the flat."""
+    """Return the rows of the printed table: kind (a key of COLORS), name, description, figures of success and of the flat."""
     named = [("combined" if line["name"] in COMBINED else "table", line["name"], line) for line in result["lines"]]
     for name, lines in result["settings"].items():
         named += [("settings", f"{name}: {line['name']}", line) for line in lines]
@@ -305,7 +305,7 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] 
 
 
 def score_text(result: dict[str, Any]) -> str:
-    """Return the score as text."""
+    """Return the score as text, or where the lines were measured if there is no score."""
     found, rule = result["score"], result["definition"]
     if found is None:
         return f"stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in result["lines"][0] else "on the flat"
@@ -340,7 +340,7 @@ def share_text(entry: dict[str, Any]) -> str:
 
 
 def draw_stress(result: dict[str, Any], path: Path) -> None:
-    """Draw a bar for each line, with its interval: success, commands followed on the flat, and the velocity error there."""
+    """Draw bars for each line: success and commands followed on the flat, with their intervals, and the velocity error."""
     rows = rows_of(result)
     names = [name for _, name, *_ in rows]
     colors = [COLORS[kind] for kind, *_ in rows]

@@ -1,4 +1,4 @@
-"""Robots, their velocities and the ground in viser's scene, as triangle meshes with a normal and a colour per vertex."""
+"""Robots, arrows for velocities, and the ground in viser's scene. Meshes have a normal and a colour for each vertex."""
 
 from typing import Any
 
@@ -21,39 +21,41 @@ from legged.robots.importing.convert import robot_spec_of
 from legged.terrain import Terrain
 
 GLIDE = np.array([0.25, 0.25, 0.06])
-"""Share of the distance to the followed robot that the view covers per picture, along x, y, z: steps then shake it less."""
+"""Share of the distance to the followed robot by which the view moves in each picture, along x, y, z. The view lags behind,
+so that it shakes less with the robot's steps.
+"""
 CUT = 2.0
-"""Distance above which the view jumps to the robot at once, because the robot was put somewhere else [m]."""
+"""Distance above which the view jumps to the robot, which must have been moved to another place [m]."""
 ARROWS_EVERY = 3
-"""Arrows move along in every picture; their lengths change in one of so many."""
+"""Number of pictures after which the lengths of arrows are updated; their positions are updated in every picture."""
 VIEW = np.array([-1.75, -2.1, 1.15])
-"""First position of the browser's camera relative to the robot, in lengths of a robot."""
+"""First position of the browser's camera relative to the robot [lengths of the robot]."""
 AMBIENT = 0.35
-"""Brightness of the ambient light; with more, light colours turn white."""
+"""Brightness of the ambient light; if it is higher, light colours turn white."""
 FOG, SKY = (25.0, 55.0), (255, 255, 255)
-"""Distances between which the ground fades into the background [m], and the background's colour."""
+"""Distances at which the ground begins and ends to fade into the background [m], and the background's colour."""
 HIDDEN = -1000.0
-"""Height of hidden arrows [m]."""
+"""Height at which arrows are out of sight [m]."""
 NARROW = 700
-"""Screens below this width have the controls below the picture instead of next to it [pixels]."""
+"""Width of a screen below which viser puts the controls below the picture instead of next to it [pixels]."""
 FARTHER, LOWER = 1.3, 1.0
-"""On narrow screens the camera is so many times as far away and looks at a point so far below the robot, in its lengths."""
+"""On narrow screens: factor on the camera's distance, and how far below the robot the camera looks [lengths of the robot]."""
 SEGMENTS = 16
-"""Segments of round shapes along their circumference: few, because a browser may draw without a GPU."""
+"""Number of segments of round shapes along their circumference. It is small, because a browser may draw without a GPU."""
 FLANK = 0.85
 """Brightness of the vertical faces of a terrain relative to its treads."""
 SHARP = 30.0
-"""Faces of a body that meet at a larger angle keep their edge [degrees]."""
+"""Angle between faces of a body above which their edge is drawn sharp [degrees]."""
 MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.85}
 PERIOD, HALF_PLANE = 2.0, 40.0
-"""Distance after which the squares of a plane repeat, and half the side of the drawn part, a multiple of it [m]."""
+"""Distance after which the squares of a plane repeat, and half the side of the drawn plane, a multiple of the first [m]."""
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices (V, 3) [m], faces (F, 3) and sRGB colours (V, 3), 0 to 1."""
 
 
 class Drawing:
     """Robots and ground of a session in a viser scene. Everything is a child of the frame `/world`, which moves opposite to
-    the followed robot. So the robot stays in the middle, and the user's view of it is kept.
+    the followed robot. So this robot stays in the middle of the user's view.
     """
 
     def __init__(self, server: Any, session: Session) -> None:
@@ -74,13 +76,13 @@ class Drawing:
         server.on_client_connect(self._fit_view)
 
     def _fit_view(self, client: Any) -> None:
-        """Move the robot to the upper half of a narrow screen, whose lower half has the controls."""
+        """On a narrow screen, show the robot in the upper half, because the controls cover the lower half."""
         if client.camera.image_width < NARROW:
             client.camera.position = tuple(FARTHER * VIEW * self.length)
             client.camera.look_at = (0.0, 0.0, -LOWER * self.length)
 
     def build(self) -> None:
-        """Replace everything drawn by the session's current task."""
+        """Remove what was drawn, and draw the session's current task."""
         for handle in self._handles:
             handle.remove()
         scene = self.server.scene
@@ -95,7 +97,7 @@ class Drawing:
             sides, columns = camera.size_of_model(model, model.qpos0), task.num_envs
         self.length = float(sides.max())
         self._model, self._data = model, mujoco.MjData(model)
-        # Offsets (N, 3) between where robots are and where they are drawn [m]; on a plane all start in one place.
+        # On a plane all robots start in one place, so they are drawn with offsets (N, 3) [m] from their positions.
         self._offsets = camera.SPACING * self.length * camera.side_by_side(task.num_envs, columns)
         if terrain is not None:
             self._offsets[:] = 0.0
@@ -109,7 +111,7 @@ class Drawing:
             for robot in robots
         ]
         self._above, self._arrows = [], []
-        if isinstance(task, LeggedRobot):  # frames above the robots that share their heading, and arrows in them
+        if isinstance(task, LeggedRobot):  # arrows in frames above the robots, which turn with their heading
             thick, nothing = 0.022 * self.length, np.full((2, 2, 3), HIDDEN, dtype=np.float32)
             heads = {"shaft_radius": thick, "head_radius": 2.2 * thick, "head_length": 4.0 * thick}
             colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)
@@ -121,13 +123,13 @@ class Drawing:
         self.draw()
 
     def _base(self, robot: int) -> np.ndarray:
-        """Return the drawn position (3,) of a robot's base, world frame [m]; sets the poses of all its bodies."""
+        """Compute the poses of a robot's bodies, and return the drawn position (3,) of its base, world frame [m]."""
         self._data.qpos[:] = np.nan_to_num(self._task.physics.qpos[robot].cpu().numpy().astype(float))
         mujoco.mj_kinematics(self._model, self._data)
         return np.asarray(self._data.xpos[1]) + self._offsets[robot]
 
     def draw(self) -> None:
-        """Update the poses; build the scene anew if the session has another task."""
+        """Update the poses, or build the scene anew if the session has another task."""
         if self._task is not self.session.task:
             self.build()
             return
@@ -182,7 +184,7 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
     parts: dict[int, list[Part]] = {}
     for geom in range(model.ngeom):
         body, material, rgba = int(model.geom_bodyid[geom]), int(model.geom_matid[geom]), model.geom_rgba[geom]
-        if material >= 0 and np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default: the file sets no colour
+        if material >= 0 and np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default, if the file sets no colour
             rgba = model.mat_rgba[material]
         if body == 0 or rgba[3] == 0.0 or model.geom_group[geom] >= camera.COLLISION_SHAPES:
             continue
@@ -218,8 +220,8 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
 
 
 def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
-    """Return a mesh with sharp edges: faces share a vertex only where their normals, in `edges` (3,) steps per unit length,
-    round to the same numbers. With zeros all faces share their vertices, so the surface is smooth.
+    """Return a mesh with sharp edges. Faces share a vertex only if their normals, multiplied by `edges` (3,), round to equal
+    numbers. If `edges` are zeros, all faces share their vertices, so the surface is smooth.
     """
     keys = np.column_stack([mesh.faces.reshape(-1), np.repeat(np.round(mesh.face_normals * edges), 3, axis=0)])
     kept, which = np.unique(keys, axis=0, return_inverse=True)
@@ -227,7 +229,7 @@ def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
 
 
 def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals) -> trimesh.Trimesh:
-    """Return a mesh whose normal at a vertex is the mean of the normals of its faces, weighted by their area."""
+    """Return a mesh whose normal at each vertex is the mean normal of the adjacent faces, weighted by their areas."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # without scipy trimesh needs a slow loop
     for corner in range(3):
@@ -237,7 +239,7 @@ def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals
 
 
 def _joined(parts: list[Part]) -> trimesh.Trimesh:
-    """Return one mesh of several parts; files hold colours as linear intensities, as glTF wants."""
+    """Return one mesh of several parts. Its colours are linear intensities, as glTF wants."""
     vertices, _, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     starts = np.cumsum([0, *(len(points) for points, _, _ in parts)])
     faces = np.concatenate([own + start for (_, own, _), start in zip(parts, starts, strict=False)])
@@ -248,8 +250,8 @@ def _joined(parts: list[Part]) -> trimesh.Trimesh:
 
 
 def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
-    """Return a terrain as the C engine collides with it, world frame [m], with the colours of films and level ground around:
-    the tops and vertical faces of its steps, and the surface of its smooth tiles.
+    """Return the surface of a terrain with which the C engine computes collisions, and level ground around it, world frame
+    [m]: tops and vertical faces of steps, and smooth tiles. Colours are those of films.
     """
     scene = mujoco.MjSpec()
     add_painted_terrain(scene, terrain, checkered=True)
@@ -268,7 +270,7 @@ def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Part:
-    """Return the upper side of a height field, split into triangles as MuJoCo splits it, with the colours of its texture."""
+    """Return the upper side of a height field with the colours of its texture, in the same triangles as in MuJoCo."""
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     half_x, half_y, high, _ = model.hfield_size[field]
@@ -284,7 +286,7 @@ def _surface(model: mujoco.MjModel, geom: int) -> Part:
 
 
 def plane_mesh() -> trimesh.Trimesh:
-    """Return a square of the ground around the origin, with dark and light squares of half the PERIOD, which show motion."""
+    """Return a square of the ground around the origin. Dark and light squares with sides of half the PERIOD show motion."""
     light = np.array([209.0, 214.0, 219.0])
     squares = np.kron([[1.0, 0.94], [0.94, 1.0]], np.ones((128, 128)))[:, :, None] * light
     corners = HALF_PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])

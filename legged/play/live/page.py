@@ -17,28 +17,27 @@ from legged.play.live.session import FASTEST, HARDEST_PUSH, NEWEST, SLOWEST, Ses
 from legged.play.viewer import STEP
 
 HOST, PORT = "127.0.0.1", 8470
-"""Default host, which only this machine reaches, and the first port that is tried."""
+"""Default host, which is reached from this machine only, and the first port that is tried."""
 TRIES = 50
 """Number of ports that are tried."""
 INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
 """Time between two pictures, two updates of the plots, and two checks for a newer checkpoint [s]."""
 IDLE_S = 0.1
-"""Time between two checks for visitors while the page has none and the simulation rests [s]."""
+"""Time between two checks for visitors while the page has none; the simulation rests meanwhile [s]."""
 SLOW = 0.9
-"""The page warns when the pace is below this."""
+"""Pace below which the page shows a warning."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
-"""Letter keys that change the command -> axis and direction. Viser's camera uses other letters and the arrows."""
+"""Keys that change the command: letter, axis and sign of the change. Viser's camera uses other letters and the arrows."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
-"""Directions of a push, from the robot's heading to the left [degrees]."""
+"""Name of a push's direction -> angle from the robot's heading, positive to the left [degrees]."""
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return the port of --port if it is free on `host`, or any free port for 0. Without `port`, return the first free one
-    from PORT on.
+    """Return `port` (--port) if it is free on `host`; for 0 any free port, and for None the first free port from PORT on.
 
     Raises:
-        ConfigError: the host is no address of this machine, or the port does not exist or is taken.
+        ConfigError: the host is not an address of this machine, or the port does not exist or is taken.
     """
     if port is not None and not 0 <= port <= 65535:
         raise ConfigError(f"--port: must be from 0 to 65535, got {port}")
@@ -46,7 +45,7 @@ def free_port(host: str, port: int | None) -> int:
         family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
     except (OSError, UnicodeError) as error:
         raise ConfigError(
-            f"--host: '{host}' is no address of this machine ({error}); {HOST} is this machine alone"
+            f"--host: '{host}' is no address of this machine ({error}); {HOST} serves this machine alone"
         ) from error
     reason = ""
     for number in [port] if port is not None else [*range(PORT, PORT + TRIES), 0]:
@@ -56,12 +55,12 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             reason = error.strerror or str(error)
     if port is None:
-        raise ConfigError(f"--host: no page can be served at '{host}' ({reason}); {HOST} is this machine alone")
-    raise ConfigError(f"--port: {port} can't be used at '{host}' ({reason}); leave it out, and a free one is found")
+        raise ConfigError(f"--host: no page can be served at '{host}' ({reason}); {HOST} serves this machine alone")
+    raise ConfigError(f"--port: {port} can't be used at '{host}' ({reason}); leave it out, and a free port is chosen")
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches a host."""
+    """Return whether a host is reached from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -88,26 +87,26 @@ def load_viser() -> Any:
 
 
 class Page:
-    """A web page that shows and controls a session. Viser calls callbacks from its own threads; they only queue actions,
-    which `run` and `do_what_was_asked` execute in the thread of their caller.
+    """A web page that shows and controls a session. Viser runs callbacks in its own threads, so they only queue actions.
+    `run` and `do_what_was_asked` execute the actions in the thread of their caller.
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
-        """Start the server; `free_port` finds a free port."""
+        """Start the server at `host` and `port`, which `free_port` finds."""
         viser = load_viser()
-        from legged.play.live.drawing import Drawing  # imports trimesh, which comes with viser
+        from legged.play.live.drawing import Drawing  # imported here, because trimesh comes with viser
 
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        with contextlib.redirect_stdout(io.StringIO()):  # hides viser's banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=session.task.cfg.task, verbose=False)
         self.port = int(self.server.get_port())
-        # Viser lets any visitor publish the page through a public tunnel; that is switched off.
+        # Viser would let any visitor publish the page through a public tunnel. This is switched off here.
         self.server.request_share_url = lambda verbose=True: None
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self.drawing = Drawing(self.server, session)
         self.sliders: list[tuple[int, Any]] = []
-        """Axis of the command and its slider."""
+        """Pairs of an axis of the command and its slider."""
         self._add_controls()
         self._add_keys()
         gui = self.server.gui
@@ -179,7 +178,7 @@ class Page:
             self._do(push.on_click, all_or_one)
 
     def _steer(self, change: Callable[[], object]) -> None:
-        """Change the command, and move the sliders to it."""
+        """Change the command by calling `change`, and move the sliders to the new command."""
         change()
         for axis, slider in self.sliders:
             slider.value = round(self.session.command[axis], 3)
@@ -196,7 +195,7 @@ class Page:
         self.refresh()
 
     def _add_keys(self) -> None:
-        """Add keys for the buttons' actions; viser lists them in its palette."""
+        """Add keys for the actions of buttons and for the command. Viser's command palette lists the keys."""
         session = self.session
 
         def press(axis: int, change: float) -> None:
@@ -219,7 +218,7 @@ class Page:
         """Update the status text and the plots."""
         session = self.session
         state = f"{session.time:.1f}\u00a0s" if session.running else f"paused at {session.time:.1f}\u00a0s"
-        slow = f"too slow: {session.pace:.0%} of the time that should pass" if session.running and session.pace < SLOW else ""
+        slow = f"too slow: {session.pace:.0%} of the chosen speed" if session.running and session.pace < SLOW else ""
         details = " · ".join(text for text in (f"robot {session.followed + 1}", session.place(), state, slow) if text)
         text = "\n\n".join([f"**{session.title()}**", details, *([f"⚠ {session.problem}"] if session.problem else [])])
         if text != self.status.content:
@@ -229,7 +228,7 @@ class Page:
         self.plots.update(session.history)
 
     def do_what_was_asked(self) -> None:
-        """Execute the actions that visitors requested since the last call."""
+        """Execute all actions that visitors have requested since the last call."""
         with contextlib.suppress(queue.Empty):
             while True:
                 self._asked.get_nowait()()

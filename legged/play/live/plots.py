@@ -14,40 +14,40 @@ from legged.policies.episodes import unit_of
 KEPT_S = 10.0
 """Length of the history [s]."""
 SMOOTHED_S = 0.2
-"""Window over which rewards are averaged, because some terms occur in single steps, such as touch-downs [s]."""
+"""Window over which rewards are averaged, because some terms, such as those of touch-downs, occur in single steps [s]."""
 AXES, UNITS = ("vx", "vy", "yaw rate"), ("m/s", "m/s", "rad/s")
 """Names and units of the components of a command."""
 OTHERS = "#7F7F7F"
 """Colour of the sum of the smaller reward terms."""
 COMMANDED, ACTUAL = COLORS[1], COLORS[0]
 DASH = (5, 2)
-"""Dash and gap of commanded velocities and of the summed reward terms [pixels]."""
+"""Lengths of dash and gap in the curves of commanded velocities and of summed reward terms [pixels]."""
 MOST_POINTS = 160
-"""Points per curve; more cannot be told apart at the width of the panel."""
+"""Largest number of points of a curve; more could not be told apart in the panel."""
 LARGEST = 6
-"""Reward terms that have a curve of their own."""
+"""Number of the largest reward terms, which have their own curves."""
 LEFT, RIGHT, X_AXIS, FRAME = 44, 12, 30, 10
-"""Width of the vertical axis, margin on the right, height of the time axis, and viser's own margin of a chart [pixels]."""
+"""Width of the vertical axis, right margin, height of the time axis, and viser's margin around a chart [pixels]."""
 SMALLEST_RANGE = 0.25
-"""Velocity axes reach at least this far up and down [m/s, rad/s]."""
+"""Least range of velocity axes, up and down from 0 [m/s, rad/s]."""
 Lines = tuple[dict[str, Any], ...]
-"""Options of uPlot for curves."""
+"""Options of several curves for uPlot."""
 
 
 class History:
-    """The last KEPT_S of a robot with F feet, K control steps, oldest first. A step that ended an episode is NaN."""
+    """The last K control steps (KEPT_S) of a robot with F feet, oldest first. A step that ended an episode is NaN."""
 
     def __init__(self, task: BaseTask) -> None:
         self.terms = task.rewards.names
         self.feet = task.robot.feet_names if isinstance(task, LeggedRobot) else ()
         self.per_second = task.cfg.rewards.times_dt
-        """Rewards are counted per second, not per step."""
+        """True: rewards are per second. False: rewards are per step."""
         self.dt = task.dt
         self.rows: deque[np.ndarray] = deque(maxlen=max(2, round(KEPT_S / task.dt)))
-        """Time, actual and commanded velocity (3 each), contacts (F), rewards in the task's unit (terms)."""
+        """Rows: time, actual and commanded velocity (3 each), contacts (F), and rewards in the task's unit (terms)."""
 
     def add(self, task: BaseTask, robot: int, time: float) -> None:
-        """Add the last control step of a task's robot, at a simulated time [s]."""
+        """Add the last control step of one of a task's robots; the simulated `time` is in [s]."""
         row = np.full(7 + len(self.feet) + len(self.terms), np.nan)
         row[0] = time
         if not bool(task.reset_buf[robot]):
@@ -62,9 +62,10 @@ class History:
         self.rows.append(row)
 
     def curves(self) -> dict[str, np.ndarray]:
-        """Return `times` (K,) before the newest step [s]; `actual` and `commanded` (3, K), vx, vy [m/s] and yaw rate [rad/s],
-        base frame; `contacts` (F, K), 1 for feet on the ground; and `rewards` (terms, K), averaged over the SMOOTHED_S before
-        each step. Tasks without commands have only the actual vx, world frame; the other velocities are NaN.
+        """Return a mapping: `times` (K,) relative to the newest step, at most 0 [s]; `actual` and `commanded` (3, K), vx, vy
+        [m/s], yaw rate [rad/s], base frame; `contacts` (F, K), 1 for feet on the ground; and `rewards` (terms, K), averaged
+        over the SMOOTHED_S before each step. In tasks without commands only the actual vx is known, in the world frame; the
+        other velocities are NaN.
         """
         feet = len(self.feet)
         table = np.array(self.rows).reshape(-1, 7 + feet + len(self.terms)).T
@@ -80,10 +81,10 @@ class History:
 
 
 class LivePlots:
-    """Charts in the container of viser's GUI that is open while the object is created."""
+    """Charts in viser's GUI, in the container that is open while this object is created."""
 
     def __init__(self, server: Any, history: History, has_commands: bool) -> None:
-        """Create the charts; without commands only the forward velocity has one."""
+        """Create the charts. For tasks without commands the only velocity chart is that of the forward velocity."""
         self._server = server
         actual, commanded = _line("actual", ACTUAL), _line("commanded", COMMANDED, DASH)
         if has_commands:
@@ -122,7 +123,7 @@ class LivePlots:
         )
 
     def update(self, history: History) -> None:
-        """Show a history."""
+        """Show the values of a history."""
         shown = slice(None, None, max(1, -(-len(history.rows) // MOST_POINTS)))
         found = history.curves()
         times, actual, commanded = found["times"], found["actual"], found["commanded"]
@@ -133,7 +134,7 @@ class LivePlots:
                 chart.data = (times[shown], *(curve[shown] for curve in curves))
             if self._gait is not None:
                 self._gait.content = gait_diagram(history.feet, times, found["contacts"], history.dt)
-            if names != self._names:  # new series make the browser build the chart anew
+            if names != self._names:  # set only if names change, because the browser builds the chart anew then
                 self._names = names
                 self._rewards.series = ({"label": "time [s]"}, *_reward_lines(names))
             self._rewards.data = (times[shown], *(curve[shown] for curve in rewards))
@@ -150,8 +151,8 @@ def _reward_lines(names: Sequence[str]) -> Lines:
 
 
 def reward_curves(terms: Sequence[str], values: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """Return the names and values (K,) of the LARGEST of some reward terms with `values` (terms, K), then those of the sum of
-    the others.
+    """Return names and curves (K,) for the LARGEST largest reward terms, then for the sum of the others, from the `values`
+    (terms, K) of all `terms`.
     """
     sizes = np.abs(np.nan_to_num(values)).sum(axis=1)
     largest = sorted(np.argsort(-sizes, kind="stable")[:LARGEST].tolist())
@@ -164,10 +165,10 @@ def reward_curves(terms: Sequence[str], values: np.ndarray) -> tuple[list[str], 
 
 
 def gait_diagram(feet: Sequence[str], times: np.ndarray, contacts: np.ndarray, dt: float) -> str:
-    """Return HTML with one row per foot, whose bars are the `times` (K,) [s] at which its row of `contacts` (F, K) is 1."""
+    """Return HTML with a row for each foot. Bars show the `times` (K,) [s] at which the foot's `contacts` (F, K) are 1."""
     rows = []
     for name, own in zip(without_common_words(feet), contacts, strict=True):
-        # The rows at which the foot comes down and leaves the ground; a row covers the `dt` before its time.
+        # Steps at which the foot comes down, and at which it has left the ground. A step covers the `dt` before its time.
         edges = np.flatnonzero(np.diff(np.concatenate([[False], own > 0.5, [False]]).astype(int)))
         bars = "".join(
             f'<rect x="{times[a] - dt:.3f}" width="{times[b - 1] - times[a] + dt:.3f}" height="1" fill="{ACTUAL}"/>'

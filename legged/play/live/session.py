@@ -1,4 +1,4 @@
-"""The simulation behind a live view: the watched policy, a few robots on the chosen ground, and the pace of time."""
+"""The simulation of a live view: the watched policy, a few robots on the chosen ground, and the speed of the simulation."""
 
 import time
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ from legged.registry import make_task
 from legged.terrain import TERRAIN_TYPES, Terrain
 
 NEWEST = "newest"
-"""Choice of the newest checkpoint. The alternative, BEST, exists if the training evaluates its policy."""
+"""Choice that follows the newest checkpoint. The other choice, BEST, exists if the training evaluates its policy."""
 OWN, PLANE = "the task's own", "plane"
-"""Grounds without a chosen type: tiles of each type of the task, or a plane."""
+"""Kinds of ground other than a terrain type: tiles of all types of the task, and a plane."""
 HOURS_S = 36000.0
-"""Length of an episode of robots that follow commands, so long that it does not end [s]."""
+"""Length of an episode of robots that follow commands. It is long, so that no time-out interrupts the view [s]."""
 APART = 1.0
-"""Largest distance from the middle of a tile at which robots that share it start, times the scale of the terrain [m]."""
+"""If robots share a tile: largest distance of their starts from its middle, in x and in y, at terrain.scale 1 [m]."""
 MOST_ROBOTS = 16
 """Largest number of robots."""
 SLOWEST, FASTEST = 0.1, 4.0
@@ -39,25 +39,27 @@ SLOWEST, FASTEST = 0.1, 4.0
 HARDEST_PUSH = 3.0
 """Largest change of a robot's velocity by one push [m/s]."""
 BEHIND_S = 0.2
-"""Largest delay that is made up for; longer ones mean that the machine is too slow or was busy [s]."""
+"""Largest delay that the simulation makes up for. If it is longer, the machine is too slow or was busy [s]."""
 PACE_S = 2.0
-"""Time over which the pace is measured [s]."""
+"""Real time over which the pace is measured [s]."""
 FREE_JOINT = 0
 """MuJoCo's joint type of a floating base."""
 
 
 @dataclass
 class Watched:
-    """A run folder or a shipped policy, which notices when the checkpoint to show changes."""
+    """A run folder or a shipped policy that is watched for changes of the checkpoint to show."""
 
     cfg: TaskConfig
     folder: Path
     checkpoint: int | None = None
-    """Iteration that is shown; None follows the training."""
+    """Iteration of the checkpoint that is shown; None to follow the training."""
     choice: str = NEWEST
-    """Checkpoint that is followed: NEWEST or BEST; without effect if `checkpoint` is an iteration."""
+    """Checkpoint that is followed, NEWEST or BEST. It has no effect if `checkpoint` is an iteration."""
     shown: tuple[Path, int, int] | None = field(default=None, init=False)
-    """Last result of `changed`: file, time of its last change [ns] and size; None makes the next call return it again."""
+    """File that `changed` returned last, with the time of its last change [ns] and its size [bytes]. If this is set to None,
+    the next call returns the file again.
+    """
 
     @property
     def has_best(self) -> bool:
@@ -74,21 +76,21 @@ class Watched:
         return found[max(found)] if found else None
 
     def changed(self) -> Path | None:
-        """Return the checkpoint to show if it is another file than at the last call or was rewritten, else None."""
+        """Return the checkpoint to show if the file is new or was rewritten since the last call, else None."""
         path = self.wanted()
         if path is None:
             return None
         try:
             stat = path.stat()
-        except OSError:  # replaced by a newer one
+        except OSError:  # a newer file has just replaced it
             return None
         before, self.shown = self.shown, (path, stat.st_mtime_ns, stat.st_size)
         return None if self.shown == before else path
 
 
 def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
-    """Return the run that `name` names as POLICY; without a name the newest run of all. The run may be so young that it has
-    no checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
+    """Return the run that the argument POLICY, `name`, stands for; without a name the newest run. The run need not have a
+    checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
 
     Raises:
         ConfigError: there is no such run, or it has no such checkpoint.
@@ -102,8 +104,8 @@ def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
 
 
 def grounds_of(cfg: TaskConfig) -> list[str]:
-    """Return the kinds of ground that can be chosen, the task's own first. A model with its own floor and a task whose
-    terrain is a single tile have only one.
+    """Return the kinds of ground that can be chosen, the task's own first. There is only one if the model has its own floor
+    or the task's terrain is a single tile.
     """
     if not isinstance(cfg, LeggedConfig):
         return [OWN]
@@ -114,7 +116,7 @@ def grounds_of(cfg: TaskConfig) -> list[str]:
 
 
 def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) -> str:
-    """Return the kind of ground of --terrain and --difficulty: OWN, PLANE or a type of terrain.
+    """Return the kind of ground for the options --terrain and --difficulty: OWN, PLANE or a terrain type.
 
     Raises:
         ConfigError: the type or the difficulty does not exist, or the task has a single ground.
@@ -125,14 +127,14 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
         return kinds[0] if kind is None else kind
     for flag, given in (("terrain", kind), ("difficulty", difficulty)):
         if given is not None:
-            raise ConfigError(f"--{flag}: '{cfg.task}' has no terrain to choose; it has one of its own")
+            raise ConfigError(f"--{flag}: '{cfg.task}' has no terrain to choose: its ground is fixed")
     return kinds[0]
 
 
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    """Return overrides for that many robots, undisturbed except for the overrides in `asked`."""
+    """Return overrides for `num_envs` undisturbed robots; the overrides in `asked` may disturb them."""
     if isinstance(cfg, LeggedConfig):
-        keep_length = len(grounds_of(cfg)) == 1  # the episode ends at the edge of the tile, or a little before
+        keep_length = len(grounds_of(cfg)) == 1  # on a single tile, episodes have to end before the edge
         seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
         return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
     return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
@@ -150,8 +152,8 @@ class Session:
         device: torch.device | str = "cpu",
         graph: bool = False,
     ) -> None:
-        """Build the task of the watched policy's configuration with `changes` on ground of a `kind`, OWN, PLANE or a type of
-        terrain, with tiles of a `difficulty`, 0 to 1, that of `play` by default; and load the present checkpoint.
+        """Build the task of the watched policy, with the overrides `changes`, and load the present checkpoint. The `kind` of
+        ground is OWN, PLANE or a terrain type; the `difficulty` of tiles is 0 to 1, by default that of `play`.
 
         Raises:
             ConfigError: the task cannot be built, or the policy does not fit it.
@@ -159,7 +161,7 @@ class Session:
         self.watched, self.changes = watched, list(changes)
         self.device, self._graph = torch.device(device), graph
         self.grounds = grounds_of(watched.cfg)
-        """Kinds of ground that can be chosen; a single one means that there is no choice."""
+        """Kinds of ground that can be chosen; if there is only one, there is no choice."""
         self.iteration: int | None = None
         """Training iterations of the loaded policy; None without a checkpoint."""
         self.checkpoint = watched.wanted()
@@ -172,9 +174,9 @@ class Session:
         self.followed = 0
         """Number of the robot that the camera follows and the plots show."""
         self.pace = 1.0
-        """Share of the recently due steps that were made: below 1 if the machine is too slow."""
+        """Ratio of made to due steps over the last PACE_S; it is below 1 if the machine is too slow."""
         self._due = self._wanted = self._made = 0.0
-        if self.checkpoint is not None:  # before anything is built
+        if self.checkpoint is not None:  # check the checkpoint before anything is built
             check_fits(self.checkpoint, read_checkpoint(self.checkpoint), watched.cfg)
         self._build(kind, difficulty)
         self.command = self.clipped([0.0, 0.0, 0.0])
@@ -190,8 +192,8 @@ class Session:
         self.look()
 
     def look(self) -> bool:
-        """Load the checkpoint to show if it has changed; return whether a policy was loaded. If loading fails, `problem`
-        holds the reason and the present policy stays in use.
+        """If the checkpoint to show has changed, load it; return whether a policy was loaded. If loading fails, `problem`
+        holds the reason, and the present policy stays in use.
         """
         path = self.watched.changed()
         if path is None:
@@ -212,14 +214,14 @@ class Session:
             return f"{task}: no checkpoint yet in {relative(self.watched.folder)}; robots keep their default pose"
         written = ""
         if self.checkpoint.stem.startswith("model_"):
-            with suppress(OSError):  # it may have been removed
+            with suppress(OSError):  # the file may have been removed
                 written = f", written {ago(max(0.0, time.time() - self.checkpoint.stat().st_mtime))}"
         return f"{task}: iteration {self.iteration}{written} ({relative(self.checkpoint)})"
 
     # ---- time --------------------------------------------------------------------------------------------------------
 
     def pass_time(self, seconds: float) -> int:
-        """Make the control steps that are due after some real time [s]; return their number."""
+        """Make the control steps that are due after `seconds` of real time [s]; return the number of steps."""
         if not self.running:
             self._due = 0.0
             return 0
@@ -270,7 +272,7 @@ class Session:
         self.command = self.clipped([*self.command[:axis], value, *self.command[axis + 1 :]])
 
     def stand(self) -> None:
-        """Set the command to zero, or to the slowest one of the training."""
+        """Set the command to zero or, where the training's ranges lack zero, to the value in the range nearest to zero."""
         self.command = self.clipped([0.0, 0.0, 0.0])
 
     def select(self, robot: int) -> None:
@@ -280,8 +282,8 @@ class Session:
 
     @torch.inference_mode()
     def push(self, degrees: float, strength: float, everybody: bool = False) -> None:
-        """Change the velocity of the followed robot's base, or of all bases with `everybody`, by `strength` [m/s], in a
-        direction that is `degrees` to the left of the heading.
+        """Push the followed robot, or all robots if `everybody`: change the velocity of the base by `strength` [m/s], in a
+        direction `degrees` to the left of the robot's heading.
         """
         if not self.can_be_pushed:
             return
@@ -293,8 +295,8 @@ class Session:
         self.task.sense()
 
     def go_to(self, kind: str, difficulty: float | None) -> None:
-        """Move the robots to tiles of a type and a difficulty, 0 to 1, to the task's own ground, or to a plane. If it cannot
-        be built, `problem` has the reason and the present ground stays.
+        """Move the robots to another `kind` of ground: OWN, PLANE or a terrain type, with tiles of a `difficulty`, 0 to 1. If
+        the ground cannot be built, `problem` holds the reason, and the present ground stays.
         """
         try:
             self._build(kind, difficulty)
@@ -327,7 +329,7 @@ class Session:
             terrain = playground.build(cfg)  # type: ignore[arg-type]
         self.task: Any = make_task(cfg, self.device, self._graph, terrain)
         self.can_be_pushed = self.task.physics.model.jnt_type[:1].tolist() == [FREE_JOINT]
-        """The base floats, as a push requires."""
+        """True if the base floats, because only floating bases can be pushed."""
         self.has_commands = isinstance(self.task, LeggedRobot)
         self.ranges: list[list[float]] = self.task.command_sampler.full_ranges.tolist() if self.has_commands else []
         """Ranges of vx, vy [m/s] and yaw rate [rad/s] in training; empty for tasks without commands."""

@@ -5,7 +5,7 @@
   const LEFT = 50, RIGHT = 8, TOP = 6, BOTTOM = 20;
   const FONT = "11px system-ui, sans-serif", GRID = "#e4e4e4", INK = "#444", CURSOR = "#b00020";
   let row = 0, playing = false, began = 0, from = 0, drawn = -1;
-  let first = 0, last = steps - 1; // what the plots show
+  let first = 0, last = steps - 1; // first and last step that the plots show
   const plots = [];
 
   // Numbers lie row by row, as 32-bit floats.
@@ -80,7 +80,7 @@
       const share = Math.max(0, Math.min(1, (event.clientX - box.left - LEFT) / inner));
       show(first + share * (last - first));
     };
-    // Hovering moves the cursor while nothing plays; pressing always does.
+    // Hovering moves the cursor only while nothing plays; pressing always moves it.
     holder.addEventListener("pointermove", (event) => { if (!playing || event.buttons) { pause(); move(event); } });
     holder.addEventListener("pointerdown", (event) => { pause(); move(event); });
     return plot;
@@ -222,7 +222,7 @@
   }
 
   function drawSticks(brush, places) {
-    // From the side and a little above: x to the right, z up, y into the picture.
+    // The view is from the side and a little above: x points to the right, z up, and y into the picture.
     const all = film.places[0], spread = (axis) => Math.max(...all.map((p) => p[axis])) - Math.min(...all.map((p) => p[axis]));
     const scale = 0.5 * picture.height / Math.max(0.2, spread(0), spread(2)), root = places[0];
     const flat = (p) => [
@@ -271,7 +271,7 @@
     }
   }
 
-  // Where the plots show a part of the time only, they go on with the cursor, a page at a time.
+  // If the plots show only a part of the time, they follow the cursor a page at a time.
   const span = document.getElementById("span");
   function follow() {
     const wide = Math.round(Number(span.value) / dt), before = first + "," + last;
@@ -323,7 +323,7 @@
   new ResizeObserver(redraw).observe(document.getElementById("plots"));
   redraw();
 
-  // For tests and for the console of a browser.
+  // These are for tests and for the console of a browser.
   window.episode = {
     show: (k) => { pause(); show(k); },
     state: () => ({ row, time: (row + 1) * dt, picture: drawn, playing, clock: clock.textContent,
