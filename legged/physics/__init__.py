@@ -36,16 +36,16 @@ __all__ = [
 
 
 MANY_WORLDS = 256
-"""Number of worlds from which `auto` chooses mujoco_warp without a GPU too: with so many, its speed makes up for compiling
-its kernels."""
+"""Smallest number of worlds for which `auto` chooses mujoco_warp even without a GPU, because its speed then makes up for the
+compilation of its kernels."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
     """Return the name of the engine that runs on a device. `auto` means mujoco_warp on a GPU, and on a CPU for `MANY_WORLDS`
     or more; otherwise it means the C engine. Error messages begin with `where`, the setting's dotted path.
 
-    On a CPU, `auto` takes mujoco_warp for its fused step only: `make_physics` returns the C engine for a model that the fused
-    step does not support.
+    On a CPU, `auto` means mujoco_warp only because of its fused step. If the fused step does not support a model,
+    `make_physics` returns the C engine.
 
     Raises:
         ConfigError: the C engine was requested on a GPU, or the requested engine is not installed.
@@ -93,21 +93,21 @@ def check_engine(
     others = "sim.physics=mujoco_warp or mujoco"
     if not isinstance(scene, RobotScene):
         raise ConfigError(
-            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; {others} do"
+            f"{where('sim.physics')}: newton simulates robots with a floating base, not {scene.name}; use {others}"
         )
     if scene.robot.passive is not None:
         raise ConfigError(
             f"{where('sim.physics')}: newton does not simulate the joints of '{scene.robot.name}' that no motor drives"
-            f" (passive_joints), and their loops; {others} do"
+            f" (passive_joints), and their loops; use {others}"
         )
     for field in randomized:
         if sim.solver != "mujoco" and field not in NEWTONS_FIELDS:
             can = suggest(field, NEWTONS_FIELDS, "newton can")
             path = where(f"domain_rand.ranges.{field}")
-            raise ConfigError(f"{path}: newton's {sim.solver} cannot randomise it{can}; sim.solver=mujoco and {others} can")
+            raise ConfigError(f"{path}: newton's {sim.solver} cannot randomise it{can}; use sim.solver=mujoco or {others}")
     if quantities:
         names = ", ".join(quantities)
-        raise ConfigError(f"{where('sim.physics')}: newton does not compute {names} for the task; {others} does")
+        raise ConfigError(f"{where('sim.physics')}: newton does not compute {names} for the task; use {others}")
 
 
 def make_physics(

@@ -34,7 +34,7 @@ class Physics(ABC):
     orientation (w, x, y, z). Current after a step; after a refresh it includes writes."""
     qvel: Tensor
     """(N, nv) float32 velocities in MuJoCo's layout, [m/s] and [rad/s]. A free joint has the linear velocity of its origin,
-    world frame, then its angular velocity, body frame. Current as `qpos`."""
+    world frame, then its angular velocity, body frame. Current when `qpos` is."""
     ctrl: Tensor
     """(N, nu) float32 controls, in the unit of the model's actuators ([N m] for motors of gear 1). The task writes them in
     place before a step; they keep their values until written again."""
@@ -48,10 +48,10 @@ class Physics(ABC):
     """Reason why parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused step
     does everything, or if the engine has no fused step."""
     why_c_engine: str = ""
-    """Reason for which `auto` chose the C engine instead of the fused step for this many worlds; empty otherwise."""
+    """Reason why `auto` chose the C engine instead of the fused step for this many worlds. Empty if it did not."""
     fitted: str = ""
-    """Description of the simple shapes that replace meshes, which the terrain collider does not support; empty without such
-    shapes."""
+    """Description of the simple shapes that replace meshes, because the terrain collider does not support meshes. Empty if no
+    mesh was replaced."""
     compiled: int = 0
     """Number of kernel modules that were compiled for this physics, because the cache lacked them."""
     overflowed: Tensor
@@ -59,7 +59,7 @@ class Physics(ABC):
     kernels: "TaskKernels | None" = None
     """Warp kernels that replace torch operations in parts of a task; None if the engine does not use Warp."""
     library_step: Callable[[], None] | None = None
-    """Physics step of the engine's library, for comparison with the fused step; None if `step` is that step already."""
+    """Physics step of the engine's library, for comparison with the fused step; None if `step` is the library's step."""
     _quantities: dict[str, Tensor]
     """Requested quantities by name."""
 
@@ -100,8 +100,8 @@ class Physics(ABC):
     @abstractmethod
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
         """Prepare `redraw` for `fields`, which must not be derived fields (`Field.derived`). `drawn` (N, V) is the tensor
-        that every `redraw` reads. `columns` gives each field's columns in it: one per world, or one per row. If another field
-        changes the same array, its columns must be included.
+        that every `redraw` reads. `columns` gives the columns of each field in `drawn`: one for all rows, or one per row.
+        They must include the columns of all other fields that change the same arrays.
         """
 
     @abstractmethod
@@ -133,8 +133,8 @@ class Physics(ABC):
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
-        """Return the arrays (N, ...) that determine the following steps, except `ctrl`, and the outputs of the last step.
-        After `load_state` with copies of them, the engine repeats the same steps; on a CPU they are bit-identical.
+        """Return the arrays (N, ...) that determine the following steps, and the outputs of the last step. `ctrl` is left
+        out. After `load_state` with copies of them, the engine repeats the same steps. On a CPU the steps are bit-identical.
         """
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:

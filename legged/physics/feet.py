@@ -16,14 +16,14 @@ from legged.robots.robot import Robot
 @dataclass(frozen=True)
 class FootChains:
     """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), ordered from the foot to the
-    base; lengths are in metres. Each hinge has a frame that is fixed in the frame of the next hinge at angle 0, and turns
-    points about its axis.
+    base; lengths are in metres. Each hinge has a frame, in which it turns points about its axis. At angle 0 this frame has a
+    fixed pose in the frame of the next hinge.
     """
 
     offset: np.ndarray
     """(F, 3) position of the foot in the frame of its first hinge: the mean of the centres of the foot's shapes."""
     position: np.ndarray
-    """(levels, F) index of the hinge's angle in MuJoCo's generalised positions; `speed` is its index in the velocities."""
+    """(levels, F) index of the hinge's angle in MuJoCo's generalised positions; `speed` is the index of its velocity."""
     speed: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
@@ -73,8 +73,8 @@ class _Hinge:
 
 
 def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
-    """Return the hinges from `body` up to `base`, and the body's point `offset` in the frame of the first hinge. A body that
-    is welded to its parent adds no hinge; the hinges of one body follow each other. Error messages begin with `where`.
+    """Return the hinges from `body` up to `base`, and the point `offset` of the body, converted to the frame of the first
+    hinge. A body that is welded to its parent adds no hinge. A body may have several. Error messages begin with `where`.
 
     Raises:
         ConfigError: a joint is not a hinge.
@@ -121,7 +121,7 @@ class _Level:
     """One hinge of every chain, as matrices that act on column vectors."""
 
     position: Tensor
-    """(F,) index of the angle in the positions; `speed` is its index in the velocities."""
+    """(F,) index of the hinge's angle in the positions; `speed` is the index of its velocity."""
     speed: Tensor
     anchor: Tensor
     """(F, 3, 1) [m]"""
@@ -138,9 +138,9 @@ class _Level:
 class FeetKinematics:
     """Forward kinematics of the feet in torch.
 
-    An engine's own kinematics describe the start of a step. These are computed from the current joint state, so they are
-    never stale, and they need no engine call. Worlds are the last dimension, which is contiguous in memory: with vectors
-    last, the computation takes twice as long.
+    An engine's own kinematics describe the start of a step. The kinematics here are computed from the current joint state, so
+    they are never stale, and they need no engine call. Worlds are the last dimension, which is contiguous in memory, because
+    with vectors last the computation takes twice as long.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
@@ -174,7 +174,7 @@ class FeetKinematics:
         """
         feet, worlds = len(self._offset), len(state.base_pos)
         angles, rates = self._qpos.t().contiguous(), self._qvel.t().contiguous()
-        moved = torch.zeros(feet, 3, 2, worlds)  # points and their velocities; after the last level, in the base frame
+        moved = torch.zeros(feet, 3, 2, worlds)  # points and velocities; the last level ends in the base frame
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor

@@ -30,13 +30,13 @@ def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def linear_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuators whose force is gear * gain * control: without muscles, and with a non-zero first gear."""
+    """Return the actuators whose force is gear * gain * control: all with a non-zero first gear, except muscles."""
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
     return np.flatnonzero((model.actuator_gear[:, 0] != 0.0) & ~muscle)
 
 
 def per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return the gain that corresponds to one unit of force, for each actuator, (nu,)."""
+    """Return, for each actuator, the gain that makes one unit of control one unit of force, (nu,)."""
     gear = model.actuator_gear[:, 0]
     return np.divide(1.0, gear, out=np.zeros_like(gear), where=gear != 0.0)
 
@@ -245,8 +245,8 @@ MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
 """Fields that change the model, which `Physics.randomize` accepts. The others affect only the control law."""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""Fields that can be randomised in every Newton solver, whose model has its own names and arrays. Newton's MuJoCo solver
-supports all fields."""
+"""Fields that can be randomised in every solver of Newton, because Newton's own model has an array for them. Newton's MuJoCo
+solver supports all fields."""
 
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:

@@ -1,5 +1,5 @@
 """C MuJoCo on all CPU cores, through `mujoco.batch.Batch`: the default engine without a GPU, and the reference for the
-others.
+other engines.
 """
 
 from collections.abc import Collection, Mapping
@@ -53,9 +53,9 @@ class MujocoPhysics(Physics):
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)
-        # A world that diverges must stay non-finite until the task sees it; the engine would reset it silently.
+        # A world that diverges must stay non-finite until the task sees it. By default the engine resets it silently.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        # A world holds one robot, and finding its constraint islands costs 6 % of a step.
+        # Constraint islands gain nothing, because a world holds one robot. Finding them costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float64, device)
@@ -97,7 +97,7 @@ class MujocoPhysics(Physics):
     def refresh(self) -> None:
         self._read()
         if self._robot is not None:
-            self._robot.read()  # first, since the sensors hold the results of the last call
+            self._robot.read()  # before `_reader` calls the engine, which overwrites the sensors
         self._reader.read()
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
@@ -198,7 +198,7 @@ class _RobotReader:
         state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
-        if self.stepped:  # a write after the last read has cleared the forces of its worlds
+        if self.stepped:  # only once per step: a later write clears the forces of its worlds
             forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
             if self._contacts is None:
                 state.contact_forces.copy_(forces)

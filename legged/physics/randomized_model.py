@@ -33,8 +33,8 @@ class RandomizedModel:
     def give(self, field: str, values: Tensor) -> dict[str, Tensor]:
         """Take the `values` of a field, (N,) or (N, rows), and return the arrays that it changes, (N, ...).
 
-        The arrays are computed from the model's own numbers and the latest values of all fields. Values given again replace
-        earlier ones.
+        The arrays are computed from the model's own numbers and the latest values of all fields. New values of a field
+        replace its earlier ones.
 
         Raises:
             ValueError: the model was not made for this field, or the values have another shape.
@@ -71,7 +71,7 @@ class RandomizedModel:
         if change.weight is not None:
             weight = torch.from_numpy(change.weight(self.model)).to(self._device, self._dtype)
             values = values * weight[rows]
-        part = array if change.column is None else array[:, :, change.column]  # a view
+        part = array if change.column is None else array[:, :, change.column]  # a view of `array`
         values = values.reshape(*values.shape, *[1] * (part.dim() - 2))
         old = part[:, rows]
         part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
@@ -117,7 +117,7 @@ def check_ranges(
         ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for
             example because it leaves no mass.
     """
-    model = scene.model(sim, "none") if ranges else None  # without the ground, which no field changes
+    model = scene.model(sim, "none") if ranges else None  # no field changes the ground, so it is left out
     for name in ranges:
         if name not in FIELDS:
             path = where("domain_rand.ranges")
@@ -139,5 +139,5 @@ def check_ranges(
             if change.least is not None and numbers.min() < change.least:
                 raise ConfigError(
                     f"{path}: its lowest value, {low:g} ({field.meaning}), makes {change.array} {numbers.min():g};"
-                    f" it must be at least {change.least:g}"
+                    f" {change.array} must be at least {change.least:g}"
                 )

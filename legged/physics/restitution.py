@@ -1,4 +1,4 @@
-"""Contact damping that realises a given restitution, which MuJoCo's contact model does not have as a parameter."""
+"""Contact damping that gives a wanted restitution. MuJoCo's contact model has no parameter for restitution."""
 
 import math
 
@@ -10,7 +10,7 @@ POINTS = 1024
 
 def kept_speed(ratio: float) -> float:
     """Return the restitution of a body on a spring and damper with damping ratio `ratio` (0 to 1): the share of its speed
-    that it keeps. The contact ends as soon as it no longer pushes.
+    that it keeps. The contact ends as soon as its force no longer pushes.
 
     Source: Schwager and Poeschel, Coefficient of restitution and linear-dashpot model revisited (Granular Matter 9, 2007),
     equation 21: exp(-r / w * angle) with w = sqrt(1 - r^2) and angle = atan2(2 r w, 2 r^2 - 1); exp(-2) at r = 1.

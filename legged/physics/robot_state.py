@@ -64,7 +64,7 @@ class DrivenJoints:
 
 def robot_state(qpos: Tensor, qvel: Tensor, robot: Robot) -> RobotState:
     """Return the state of robots with generalised positions `qpos` (N, nq) and velocities `qvel` (N, nv). Its fields are
-    views of them where possible, and zeroed tensors otherwise.
+    views of `qpos` and `qvel` where possible, and zeroed tensors otherwise.
     """
 
     def zeros(*shape: int) -> Tensor:

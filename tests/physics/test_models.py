@@ -288,7 +288,7 @@ def test_a_robot_has_quantities_too(robot, make_physics, name):
 def test_newton_simulates_robots_only(robot):
     sim = SimConfig(physics="newton")
     with pytest.raises(
-        ConfigError, match=r"mine.yaml: sim.physics: newton .* not .*half_cheetah.xml; sim.physics=mujoco_warp or"
+        ConfigError, match=r"mine.yaml: sim.physics: newton .* not .*half_cheetah.xml; use sim.physics=mujoco_warp or"
     ):
         check_engine(ModelScene(ASSETS / "half_cheetah.xml"), sim, CPU, "mine.yaml: {}".format)
     with pytest.raises(ConfigError, match=r"sim.physics: newton does not compute cinert"):
@@ -305,7 +305,7 @@ def test_newton_simulates_robots_only(robot):
     [
         (None, "No such file|cannot read"),
         ("<mujoco", "cannot read"),
-        ("<mujoco><worldbody><body mocap='true'><geom size='1'/></body></worldbody></mujoco>", "it has mocap bodies"),
+        ("<mujoco><worldbody><body mocap='true'><geom size='1'/></body></worldbody></mujoco>", "the model has mocap bodies"),
         ("<mujoco><option><flag sleep='enable'/></option></mujoco>", "sleeping bodies"),
     ],
 )

@@ -2,8 +2,8 @@
 and end discs of cylinders.
 
 A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
-surface in points of its rims: those in which it would rest on a plane with the slope of the ground under its centre. Vertical
-faces and their rims meet the discs at its two ends, and the segment between the ends, as for a capsule.
+surface in the points of its rims in which it would rest on a plane with the slope of the ground under its centre. It touches
+vertical faces and their rims with the discs at its two ends, and with the segment between the ends, as a capsule does.
 """
 
 from collections.abc import Iterable, Iterator
@@ -85,7 +85,7 @@ def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[C
 
 @wp.func
 def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
-    """Find the hits of a thin disc with vertical faces and their rims. Return the number of hits in the row."""
+    """Find the possible contacts of a thin disc with vertical faces and rims. Write them to `row`, and return their number."""
     found = around_point(ground, centre, radius + margin, True, hits, row)
     count = wp.int32(0)
     for k in range(found):
@@ -107,7 +107,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
                 to[1] = to[1] + shift
             away = wp.length(to)
             dist = NOTHING
-            # a rim across the axis meets the cylinder between its ends, or no disc
+            # a rim across the axis can touch the cylinder between its ends, but no disc
             if wp.abs(along) > LENGTHWISE and away > 1e-6:
                 normal = -to / away
                 point = centre - normal * radius
@@ -132,8 +132,8 @@ def find_hits(
     hits: Hits,
     row: int,
 ) -> int:
-    """Find the hits of a geom's feature within `near` [m], the sum of its radius and the contact margin. Return the number of
-    hits in the row. A hit's distance is that of its point, before the radius is subtracted.
+    """Find the possible contacts of a geom's feature within `near` [m], the sum of the feature's radius and the contact
+    margin. Write them to `row`, and return their number. Distances are those before the radius is subtracted.
     """
     if kind == BETWEEN:
         return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)

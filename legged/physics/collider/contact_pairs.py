@@ -9,13 +9,13 @@ import numpy as np
 
 KINDS = mujoco.mjtGeom
 ROUND = (int(KINDS.mjGEOM_SPHERE), int(KINDS.mjGEOM_CAPSULE))
-"""Types of shapes that collide with each other as a segment, or a point, with a radius."""
+"""Types of shapes that consist of a point or a segment with a radius, and that collide with each other as such."""
 ON_PLANES = (*ROUND, int(KINDS.mjGEOM_ELLIPSOID), int(KINDS.mjGEOM_CYLINDER), int(KINDS.mjGEOM_BOX))
 """Types of shapes that touch a plane in a few points."""
 POINT, END, CORNER, RIM, ELLIPSOID = range(5)
-"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: the same at an end of a capsule,
-with friction along the capsule's axis. CORNER: corner of a box, which counts only if it is below the box's centre. RIM: the
-`radius`-th rest point of a cylinder. ELLIPSOID: the lowest point of an ellipsoid."""
+"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: an end of a capsule, with its
+radius and with friction along the capsule's axis. CORNER: corner of a box, which counts only if it is below the box's centre.
+RIM: the `radius`-th rest point of a cylinder. ELLIPSOID: the lowest point of an ellipsoid."""
 SPRING = 7
 """Number of parameters of a constraint's spring: stiffness [1/s^2], damping [1/s], least and greatest impedance, the depth at
 which the impedance is greatest [m or rad], and midpoint and power of the curve between."""
@@ -75,8 +75,8 @@ def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1)
 
 
 def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: bool) -> np.ndarray:
-    """Return the SPRING numbers of a constraint with MuJoCo's `solref` and `solimp`. With `safe`, its time constant is at
-    least two time steps.
+    """Return the SPRING numbers of a constraint with MuJoCo's `solref` and `solimp`. With `safe`, the constraint's time
+    constant is at least two time steps.
 
     Source: MuJoCo documentation, "Modeling", solver parameters. For a solref that `is_mixed`, mujoco-warp computes an
     infinite stiffness.
@@ -124,7 +124,7 @@ def pairs_of(m: Any) -> list[tuple[int, int, int]]:
     kinds = m.geom_type.numpy()
     found = []
     for (first, second), (pair, _) in zip(geoms.tolist(), pairs.tolist(), strict=True):
-        if pair > -2:  # otherwise only a sensor uses the pair
+        if pair > -2:  # -2 marks a pair that only a sensor uses
             found.append((first, second, pair) if kinds[first] <= kinds[second] else (second, first, pair))
     return found
 

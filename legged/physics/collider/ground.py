@@ -16,7 +16,7 @@ RIDGE = wp.constant(0.02)
 SAME = wp.constant(0.999)
 """Cosine between the normals of neighbouring surfaces above which they count as one surface."""
 NOTHING = wp.constant(1e6)
-"""Distance of a hit that does not exist [m]."""
+"""Distance that stands for no contact [m]."""
 
 
 @wp.struct
@@ -35,7 +35,7 @@ class Ground:
     cell: float
     """Edge of a cell [m]."""
     reach: int
-    """Number of cells, beyond the one below it, that the largest feature can touch."""
+    """Number of cells that the largest feature can touch on each side of the cell below its centre."""
 
 
 @wp.struct
@@ -47,7 +47,7 @@ class Hit:
     normal: wp.vec3
     point: wp.vec3
     face: bool
-    """True if the hit is with a vertical face or its rim, not with a surface."""
+    """True for a contact with a vertical face or its rim, False for one with a surface."""
 
 
 @wp.func
@@ -82,7 +82,7 @@ def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
-    """Return the hit of `p` with the tangent plane of a surface `s` at the point `foot`."""
+    """Return the possible contact of `p` with the tangent plane of a surface `s` at the point `foot`."""
     normal = wp.normalize(wp.vec3(-s[1], -s[2], 1.0))
     hit = Hit()
     hit.point = p
@@ -93,8 +93,8 @@ def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
 
 @wp.func
 def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
-    """Return the hit with the shortest way out for a point below its cell's surface: up (`top`), or through a vertical face
-    at the side of the cell.
+    """Return the possible contact of a point below its cell's surface that pushes it out by the shortest way: up (`top`), or
+    through a vertical face at the side of the cell.
     """
     best = top
     x0 = ground.x + float(i) * ground.cell
@@ -119,15 +119,15 @@ def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
 
 @wp.func
 def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
-    """Return the hit of a point over cell (i, j) with its neighbour (ni, nj): the neighbour's face, its rim, or its surface
-    where that rises.
+    """Return the possible contact of a point over cell (i, j) with the neighbouring cell (ni, nj): with the neighbour's
+    vertical face, the face's rim, or the neighbour's surface if it rises.
     """
     x0 = ground.x + float(ni) * ground.cell
     y0 = ground.y + float(nj) * ground.cell
     qx = wp.clamp(p[0], x0, x0 + ground.cell)
     qy = wp.clamp(p[1], y0, y0 + ground.cell)
     s = surface(ground, ni, nj, qx, qy)
-    # Height of the ground just before the neighbour, on the point's side. The part of the face above it is exposed.
+    # Height of the ground just before the neighbour, on the point's side. The face is exposed above this height.
     before = -NOTHING
     if ni != i:
         before = wp.max(before, surface(ground, ni - wp.sign(ni - i), nj, qx, qy)[0])
@@ -145,7 +145,7 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
             if hit.dist < 1e-6:  # the point is on the face itself: push it towards the open side
                 hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
     elif s[0] > before - FACE:
-        # One surface with a crease: the plane counts only if its nearest point lies on this cell.
+        # The two surfaces meet in a crease. The neighbour's plane counts only if its nearest point lies in the neighbour.
         plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
         x = p[0] - plane.dist * plane.normal[0]
         y = p[1] - plane.dist * plane.normal[1]
@@ -156,10 +156,10 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
 
 @wp.func
 def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -> Hit:
-    """Return the hit of a segment a-b with the `line`-th grid line across `axis` (0: x, 1: y). Its distance is that from the
-    segment to the rim of a vertical face there, or to the ridge of a continuous surface.
+    """Return the possible contact of a segment a-b at the `line`-th grid line across `axis` (0: x, 1: y). The segment touches
+    the rim of a vertical face there, or the ridge of a continuous surface.
 
-    `dist` is NOTHING where the nearest point is an end of the segment, since each end is a feature of its own.
+    `dist` is NOTHING where the nearest point is an end of the segment, because each end is a separate feature.
     """
     hit = Hit()
     hit.dist = NOTHING
@@ -181,8 +181,8 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
     s_high = surface(ground, high_i, high_j, p[0], p[1])
     rise = s_high[0] - s_low[0]
     if wp.abs(rise) > FACE:
-        # In the vertical plane across the rim: find the segment's point nearest to the rim, and the side of the rim that it
-        # lies on.
+        # In the vertical plane across the rim, find the point of the segment that is nearest to the rim, and on which side
+        # of the rim this point lies.
         rim = wp.max(s_low[0], s_high[0])
         open_side = -wp.sign(rise)
         across, up = d[axis], d[2]
@@ -193,7 +193,7 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
         if t <= 0.0 or t >= 1.0:
             return hit
         scale = 1.0 / wp.sqrt(length_sq)
-        normal = wp.vec2(-up * scale, across * scale)  # (across, up)
+        normal = wp.vec2(-up * scale, across * scale)  # components across the rim and upward
         if normal[0] * open_side + normal[1] < 0.0:
             normal = -normal
         if normal[0] * open_side < -1e-3 or normal[1] < -1e-3:
@@ -214,7 +214,7 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
 
 
 MOST = wp.constant(6)
-"""Largest number of contacts of one feature: the surfaces and faces around a sphere in a corner."""
+"""Largest number of contacts of one feature. A sphere in a corner touches several surfaces and faces."""
 
 
 @wp.struct
@@ -230,7 +230,7 @@ class Hits:
 
 @wp.func
 def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
-    """Append a hit to the `count` hits of a row if there is room. Return the new count."""
+    """Append a possible contact to a row that has `count`, if there is room. Return the new count."""
     if count >= MOST:
         return count
     hits.dist[row, count] = hit.dist
@@ -241,8 +241,8 @@ def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
 
 @wp.func
 def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits: Hits, row: int) -> int:
-    """Find the hits of a sphere around `p` that lie within `near` [m]; with `faces_only`, those with vertical faces and their
-    rims. Return the number of hits in the row.
+    """Find the possible contacts of a sphere around `p` within `near` [m]; with `faces_only`, only those with vertical faces
+    and their rims. Write them to `row`, and return their number.
     """
     count = wp.int32(0)
     cell = cell_of(ground, p[0], p[1])
@@ -276,8 +276,8 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
 
 @wp.func
 def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits, row: int) -> int:
-    """Find the hits of a capsule a-b between its ends: the nearest rim or ridge of each half. Return the number of hits in
-    the row.
+    """Find the possible contacts of a capsule a-b between its ends: the nearest rim or ridge of each half. Write them to
+    `row`, and return their number.
     """
     middle = 0.5 * (a + b)
     cell = cell_of(ground, middle[0], middle[1])
@@ -291,7 +291,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
         start = wp.where(axis == 0, ground.x, ground.y)
         low = wp.int32(wp.floor((wp.min(a[axis], b[axis]) - near - start) / ground.cell)) + 1
         high = wp.int32(wp.floor((wp.max(a[axis], b[axis]) + near - start) / ground.cell))
-        # The lines stay within the map: a world that diverges could request billions of them.
+        # Lines outside the map are skipped, because a capsule in a world that diverges could cross billions of lines.
         last = wp.where(axis == 0, ground.corners.shape[0], ground.corners.shape[1]) - 1
         for line in range(wp.clamp(low, 1, last), wp.clamp(high, 1, last) + 1):
             hit = rim_or_ridge(ground, a, b, axis, line)

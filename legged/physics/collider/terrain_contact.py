@@ -108,7 +108,7 @@ def touch_ground(
     contact_adhesion: wp.array[float],
     nacon: wp.array[int],
 ):
-    """Find up to MOST hits of a feature, and append them to the contacts. One thread per world and feature."""
+    """Find up to MOST contacts of a feature, and append them to mujoco-warp's. One thread per world and feature."""
     world, feature = wp.tid()
     geom = feature_geom[feature]
     radius = feature_radius[feature]

@@ -1,10 +1,10 @@
 """Active set of the last step: the state of each constraint row at its end, which most rows keep in the next step.
 
-The state of a row is the piece of its piecewise cost. A row of a contact or a limit exerts force or does not. A row of dry
-friction holds, or slips in one of two directions. Newton's method has converged when it knows all states. Starting from the
-acceleration of the last step alone takes four iterations: the forces of stiff contacts depend on small differences of
-accelerations, which change more than that between steps. The states seldom change, so starting from them saves half of the
-iterations and nearly all line searches.
+The state of a row tells which piece of the row's piecewise cost applies. A row of a contact or a limit exerts force or does
+not. A row of dry friction holds, or slips in one of two directions. Newton's method has converged when it knows all states.
+Starting from the acceleration of the last step alone takes four iterations, because the forces of stiff contacts depend on
+small differences of accelerations, and accelerations change by more than these between steps. The states seldom change, so
+starting from them saves half of the iterations and nearly all line searches.
 """
 
 from dataclasses import dataclass

@@ -23,8 +23,8 @@ from legged.physics.fused.wide_solver import WIDE, wide_function
 
 
 def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
-    """Return the kernel for a prepared `step` and its `contacts`. It is launched for (blocks,), with the worlds from `first`
-    to before `end`.
+    """Return the kernel for a prepared `step` and its `contacts`. It is launched with dimension (blocks,) for the worlds
+    from `first` to `end - 1`.
     """
     assert step.solver.wide is not None
     move_world = dynamics_function(step.dynamics.constants)
@@ -66,7 +66,7 @@ class BlockStep:
     """Launches of a complete step for the worlds of mujoco-warp's data on a CPU."""
 
     def __init__(self, step: TorqueStep, contacts: ContactStage, threads: int) -> None:
-        """Prepare the launches of `step` and `contacts` on several `threads`, provided that `fits` returns True."""
+        """Prepare the launches of `step` and `contacts` on several `threads`. `fits` must be True for `step`."""
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
         solver = step.solver

@@ -1,4 +1,4 @@
-"""MuJoCo's Newton solver for constraint forces in one launch: one warp of threads per world, whose data stay on the chip.
+"""MuJoCo's Newton solver for constraint forces in one launch: a warp of threads per world; the world's data stay on the chip.
 
 mujoco-warp needs about ten launches per iteration of the solver, and iterates until the slowest world has converged. Here
 each world stops on its own. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"): 0.5 (a -
@@ -75,8 +75,8 @@ def solver_constants(
 
 
 def blocks(constants: dict[str, int | bool]) -> int:
-    """Return the number of worlds that a multiprocessor must hold at least, which limits the registers per lane: as many as
-    fit its shared memory, a multiple of its four schedulers.
+    """Return the smallest number of worlds that a multiprocessor must hold, which limits the registers per lane. It is the
+    largest multiple of the four schedulers that fits the shared memory, from 4 to 32.
     """
     nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
     pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))

@@ -1,7 +1,7 @@
 """Contacts and all constraint rows in one launch: one warp of threads per world.
 
 mujoco-warp needs about ten launches, and keeps the contacts of all worlds in one pool, in the order in which threads append
-them. Here each world has its own slots in mujoco-warp's contact arrays, which are filled in the order of the shapes. Indices
+them. Here each world has its own slots in mujoco-warp's contact arrays. Slots are filled in the order of the shapes. Indices
 from rows to contacts and from contacts to rows stay valid, so code that reads these arrays works unchanged.
 
 The lanes first test points of shapes against planes, pairs of spheres and capsules, and contact features against the height
@@ -101,8 +101,8 @@ class ContactStage:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model, with mujoco-warp's `m` and `d` and worlds that differ in the arrays `randomized`, is
-        not supported; empty if it is.
+        """Return the reason why a model with mujoco-warp's `m` and `d` is not supported, or an empty text. `randomized` names
+        the arrays in which worlds differ.
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"

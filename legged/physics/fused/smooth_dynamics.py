@@ -53,8 +53,8 @@ NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SP
 PUSHED = "xfrc_applied"
 """Name of external forces among the arrays in which worlds differ."""
 ROW_LENGTHS = {"OF_INERTIA": 11, "OF_MOTION": 7, "OF_BODY": 17}
-"""Row strides in shared memory for inertias, motion axes, and the quantities of bodies. Each is the number of entries made
-odd, so that lanes that read one row each use different banks."""
+"""Row strides in shared memory for inertias, motion axes, and the quantities of bodies. Each is the number of entries,
+made odd so that lanes that read one row each use different banks."""
 MOST_BLOCKS = 32
 """Largest number of blocks per multiprocessor. It limits the registers per lane, so that 4096 worlds run at once on an
 H100."""
@@ -140,7 +140,7 @@ OF_MODEL = (
 
 
 def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) -> dict[str, int | bool]:
-    """Return the constants of smooth_dynamics.h for a model in whose arrays `randomized` worlds differ."""
+    """Return the constants of smooth_dynamics.h for a model. `randomized` names the arrays in which worlds differ."""
     trees = _trees(model)
     return {
         **{"NB": model.nbody, "NV": model.nv, "NJ": model.njnt, "NG": model.ngeom},
@@ -225,8 +225,8 @@ class SmoothDynamics:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model is not supported if worlds differ in the arrays `randomized` (MuJoCo's names); empty
-        if it is.
+        """Return the reason why a model is not supported, or an empty text. `randomized` has MuJoCo's names of the arrays in
+        which worlds differ.
         """
         for words, names in UNKNOWN.items():
             if drawn := [name for name in names if name in randomized]:
@@ -307,8 +307,8 @@ def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return the motors sorted by degree of freedom (`motor`), the first of each degree of freedom in that order
-    (`motor_start`), and its last motor or -1 (`motor_of_dof`).
+    """Return tables of motors. `motor` lists them sorted by degree of freedom. For each degree of freedom, `motor_start` is
+    the place of its first motor in that list, and `motor_of_dof` is its last motor, or -1 without a motor.
     """
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     start = np.searchsorted(np.sort(dof), np.arange(model.nv + 1))

@@ -1,10 +1,10 @@
 """A physics step in few launches: one before contacts, one for constraint forces, one for integration.
 
 mujoco-warp launches a stage for every feature that a model might have: gravity compensation, external forces, muscles with
-lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing; together
-these are a fifth of a step. This step supports trees of joints with springs and dampers that motors drive; `why_not` names
-other features of a model. External forces on bodies (`xfrc_applied`) are applied if they were requested. `qfrc_applied`,
-sensors, and the poses of bodies, sites and cameras are not computed.
+lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing, which
+adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` names a feature
+of a model that it does not support. External forces on bodies (`xfrc_applied`) are applied if they were requested.
+`qfrc_applied`, sensors, and the poses of bodies, sites and cameras are not computed.
 """
 
 from collections.abc import Collection
@@ -86,8 +86,8 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
     """Integrate one joint by semi-implicit Euler. The world's first joint also sets the overflow flags.
 
-    All reads precede all writes, because the compiler moves no read ahead of a write, so each read would wait for memory by
-    itself. For a free joint this holds separately for its position and for its orientation.
+    All reads precede all writes, so that they wait for memory together: the compiler moves no read ahead of a write. For a
+    free joint this holds separately for its position and for its orientation.
     """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]
@@ -149,8 +149,8 @@ class TorqueStep:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model is not supported if worlds differ in the arrays `randomized` (MuJoCo's names); empty
-        if it is.
+        """Return the reason why a model is not supported, or an empty text. `randomized` has MuJoCo's names of the arrays in
+        which worlds differ.
         """
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"

@@ -11,8 +11,8 @@ import numpy as np
 CONNECT, WELD, JOINT = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT"))
 SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 MOST_ROOT = 6
-"""Largest number of degrees of freedom in the root, for which every lane solves. Its entries must fit a lane's registers. The
-triangle of 6, with the right-hand side, has no more entries than there are lanes."""
+"""Largest number of degrees of freedom in the root. Every lane solves for the root, so the root's entries must fit a lane's
+registers. With 6, the triangle and the right-hand side have no more entries than there are lanes."""
 MOST_DOFS = 60
 """Largest number of degrees of freedom for which mujoco-warp keeps dense Jacobian rows. A GPU lane can hold two, which would
 allow 64."""
@@ -27,9 +27,9 @@ class Tree:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Tree":
-        """Return the elimination tree of the mass matrix with the model's equality constraints. When a matrix with their
-        entries is eliminated from the last degree of freedom to the first, its only non-zero entries couple a degree of
-        freedom with its ancestors (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
+        """Return the elimination tree of the mass matrix with the model's equality constraints. When a matrix with the
+        entries of both is eliminated from the last degree of freedom to the first, only entries that couple a degree of
+        freedom with its ancestors are non-zero (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
         """
         above: list[set[int]] = [set(_chain(model, i)) - {i} for i in range(model.nv)]
         for clique in _coupled(model):
@@ -131,7 +131,7 @@ def _of_body(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _coupled(model: mujoco.MjModel) -> Iterable[set[int]]:
-    """Yield the sets of degrees of freedom that the rows of each equality constraint of bodies, sites or joints couple."""
+    """Yield, for each equality constraint of bodies, sites or joints, the degrees of freedom that its rows couple."""
     for kind, of, *pair in zip(model.eq_type, model.eq_objtype, model.eq_obj1id, model.eq_obj2id, strict=True):
         if kind in (CONNECT, WELD):
             bodies = [model.site_bodyid[one] if of == SITE else one for one in pair]

@@ -18,7 +18,7 @@ from legged.physics.fused.tree import Tree
 SOURCE = ("wide_solver.h",)
 WIDE = 16
 """Number of worlds per block: the number of floats in a register of AVX-512. Where registers are smaller, the compiler uses
-two or four."""
+two or four of them."""
 STACK_BYTES = 2 * 1024 * 1024
 """Largest size of a block's data on a thread's stack [bytes]; Linux gives a stack 8 MB."""
 
@@ -58,7 +58,7 @@ def fits_wide(nv: int, rows: int) -> bool:
 
 
 def wide_function(constants: dict[str, Constant]) -> Any:
-    """Return the device function of the kernel, which computes one block: the worlds from `start` to before `end`, at most
+    """Return the device function of the kernel, which computes one block: the worlds from `start` to `end - 1`, at most
     `WIDE`.
     """
 
@@ -77,8 +77,8 @@ def wide_function(constants: dict[str, Constant]) -> Any:
 
 
 def wide_kernel(constants: dict[str, Constant]) -> Any:
-    """Return the kernel for a set of `wide_constants`. It is launched for (blocks,), with the worlds from `first` to before
-    `end`.
+    """Return the kernel for a set of `wide_constants`. It is launched with dimension (blocks,) for the worlds from
+    `first` to `end - 1`.
     """
     solve_block = wide_function(constants)
 

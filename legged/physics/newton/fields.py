@@ -59,14 +59,14 @@ class SolverFields:
             True: RandomizedModel(scene, model, motors, torch.float32, device),
             False: RandomizedModel(inside, solver.mj_model, others, torch.float32, device),
         }
-        """Models that fields change: True -> the motors', False -> the solver's."""
+        """Models that fields change. Key True has the model for fields of the motors, key False the solver's model."""
         self.gains, self.limits = (
             torch.tensor(own, dtype=torch.float32, device=device).repeat(worlds, 1, 1)
             for own in (model.actuator_gainprm, model.actuator_forcerange)
         )
         """(N, D, 10) gains in the first column, and (N, D, 2) least and greatest torques [N m]."""
         self.motors = bool(motors)
-        """True if motors change the requested torques."""
+        """True if the motors change the torques that the task requests."""
         bodies = solver.mjc_body_to_newton.numpy()[0]
         self._body_order = [int(np.flatnonzero(bodies == k)[0]) for k in range(simulation.layout.bodies)]
         self._base = self._body_order[simulation.layout.base]
@@ -94,7 +94,7 @@ class SolverFields:
             mjw.set_const(self._m, self._d)
 
     def _with_centres(self, made: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the arrays `made`, and, if bodies' centres of mass are among them, the arrays that follow them."""
+        """Return the arrays `made`. If bodies' centres of mass are among them, add the arrays that depend on these."""
         if "body_ipos" not in made:
             return dict(made)
         centres = made["body_ipos"]

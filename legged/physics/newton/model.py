@@ -31,7 +31,7 @@ class Layout:
     root_q: int
     """First coordinate of the free joint: position, then orientation (x, y, z, w)."""
     root_qd: int
-    """First velocity of the free joint: linear, of the base's centre of mass, then angular, both in the world frame."""
+    """First velocity of the free joint: linear velocity of the base's centre of mass, then angular velocity, world frame."""
     dof_q: np.ndarray
     """(D,) indices of the joints' coordinates, in the robot's order."""
     dof_qd: np.ndarray
@@ -64,8 +64,8 @@ def build_newton_model(
     robot: Robot, setup: SolverSetup, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any
 ) -> tuple[newton.Model, Layout]:
     """Return a model of N robots from the robot's MJCF, and its layout. All robots share one ground: a plane, or the height
-    map as one height field whose steps are ramps one cell wide. Where the height-map collider replaces it
-    (`uses_cell_collider`), a plane far below is its placeholder. `device` is a Warp device.
+    map as one height field whose steps are ramps one cell wide. If the height-map collider replaces the
+    height field (`uses_cell_collider`), a plane far below is a placeholder. `device` is a Warp device.
 
     Raises:
         ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
@@ -85,7 +85,7 @@ def build_newton_model(
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
-    # The ground is not part of a world: within one MJCF without self-collisions, nothing would collide with it.
+    # The ground is not part of a world, because within one MJCF without self-collisions, nothing would collide with it.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs
@@ -107,7 +107,7 @@ def uses_cell_collider(setup: SolverSetup, sim: SimConfig) -> bool:
 
 
 def _builder(setup: SolverSetup) -> newton.ModelBuilder:
-    """Return an empty builder with the solver's own attributes, and MuJoCo's, which the MJCF fills."""
+    """Return an empty builder with the solver's attributes and with MuJoCo's. The MJCF gives the values of the latter."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     if setup.register is not None:

@@ -32,7 +32,7 @@ def push_bodies(forces: wp.array3d[float], bodies: wp.array[int], count: int, bo
 
 
 class Simulation:
-    """N worlds in Newton's own conventions. A step is Warp launches on fixed arrays, so that a graph can capture it."""
+    """N worlds in Newton's own conventions. A step consists of Warp launches on fixed arrays, so a graph can capture it."""
 
     def __init__(self, robot: Robot, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any) -> None:
         """Build the scene and its solver. `device` is a Warp device, and must be Warp's current one.
@@ -51,7 +51,7 @@ class Simulation:
                 self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
             )
         with warnings.catch_warnings():
-            # Newton warns about any MuJoCo version but 3.17; the engine tests run with the installed version.
+            # Newton warns if MuJoCo's version is not 3.17. The engine tests run with the installed version.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
         if terrain is not None and uses_cell_collider(setup, sim):
@@ -101,8 +101,8 @@ class Simulation:
         return observables
 
     def push_with(self, forces: torch.Tensor, model: mujoco.MjModel) -> None:
-        """Apply `forces` (N, B, 6), forces [N] and torques [N m] at centres of mass in the world frame, in every step. They
-        act on the bodies with the same names as those of `model`.
+        """Apply `forces` (N, B, 6) in every step: forces [N] and torques [N m] at centres of mass, world frame. They act on
+        Newton's bodies with the same names as the B bodies of `model`.
         """
         labels = [label.rpartition("/")[2] for label in self.model.body_label[: self.layout.bodies]]
         number = {name: k for k, name in enumerate(labels)}
@@ -123,7 +123,7 @@ class Simulation:
                 launch_spring_forces(self.model, before, self.contacts, setup.springs, self.force)
             self.solver.step(before, after, self.control, self.contacts, dt / setup.substeps, **extra)
             before, after = after, before
-        if before is not self.state:  # other objects hold the addresses of `self.state`
+        if before is not self.state:  # copy, because other objects hold the addresses of `self.state`
             self.state.assign(before)
         if setup.maximal:
             newton.eval_ik(self.model, self.state, self.state.joint_q, self.state.joint_qd)

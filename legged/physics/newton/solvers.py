@@ -69,7 +69,7 @@ def _mujoco(model: newton.Model, sim: SimConfig) -> SolverMuJoCo:
         njmax=sim.njmax,
         kinematic_switchable_roots=False,  # otherwise every robot has a weld that is never used
     )
-    solver.mjw_model.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
+    solver.mjw_model.opt.warn_overflow = 0  # `refresh` counts overflows; a warning would be printed by each thread
     return solver
 
 
@@ -79,7 +79,7 @@ def _steel(model: newton.Model, sim: SimConfig) -> SolverSteel:
         enable_joint_limits=True,
         joint_limit_activation_gap=0.1,  # [rad]; by default every joint limit takes a row in every step
         articulation_constraint_max=sim.njmax,
-        warn_constraint_overflow=False,  # counted in refresh
+        warn_constraint_overflow=False,  # `refresh` counts overflows
     )
 
 
@@ -117,7 +117,7 @@ SOLVERS = {
     ),
     # Friction acts against slip within one substep only. Without contacts that remember where they began ("sticky"), the feet
     # slide apart within a second for any number of substeps and iterations. With one substep the robot diverges. With 4
-    # substeps of 8 iterations instead of 8 of 4, shapes that are pushed out of the ground leave it with a hop, and walking
+    # substeps of 8 iterations instead of 8 substeps of 4, shapes that are pushed out of the ground hop off it, and walking
     # takes six times the power.
     "xpbd": SolverSetup(
         lambda model, sim: SolverXPBD(model, iterations=4),

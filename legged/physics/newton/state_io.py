@@ -1,8 +1,8 @@
 """Conversion between Newton's arrays and those of the task: conventions of states, and contact forces by shape.
 
-Newton uses quaternions (x, y, z, w), the velocity of a body's centre of mass, world frame, and angular velocity, world frame.
-The task's arrays are in MuJoCo's layout: (w, x, y, z), the velocity of the base's origin, world frame, and angular velocity,
-base frame.
+Newton's quaternions are (x, y, z, w). It has the linear velocity of a body's centre of mass, and both velocities in the world
+frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear velocity is that of the base's
+origin in the world frame, and the angular velocity is in the base frame.
 """
 
 from typing import Any
@@ -140,7 +140,7 @@ def flag_lost_contacts(count: wp.array[int], capacity: int, overflow: wp.array[i
 
 @wp.kernel
 def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
-    """Move the solver's flags to `overflow`: the solver clears them at its next step, or never. One thread per world."""
+    """Move the solver's flags to `overflow`, because the solver clears them late or never. One thread per world."""
     world = wp.tid()
     if (int(flags[world]) & lost) != 0:
         overflow[world] = 1
@@ -211,8 +211,8 @@ class NewtonStateIO(RobotStateIO):
         wp.launch(put_states, dim=len(self._qpos), inputs=inputs, outputs=[self._joint_q, self._joint_qd])
 
     def note_lost_contacts(self) -> None:
-        """Record until the next refresh that contacts were lost in this step, in the pool of contacts or according to the
-        solver's flags, which this clears.
+        """Record until the next refresh that this step lost contacts, because the pool of contacts was full or the solver set
+        its flags. This clears the solver's flags.
         """
         simulation, contacts = self._simulation, self._simulation.contacts
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_max]

@@ -28,7 +28,7 @@ class ModelScene(Scene):
         """
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", ".* is deprecated")  # the file may not be the user's own
+                warnings.filterwarnings("ignore", ".* is deprecated")  # the user may be unable to change the file
                 spec = mujoco.MjSpec.from_file(str(self.path))
                 set_options(spec.option, sim)
                 model = spec.compile()
@@ -43,7 +43,7 @@ class ModelScene(Scene):
         }
         for kind, count in kinds.items():
             if count:
-                raise ConfigError(f"{self.name}: it has {kind}, whose state the engines do not keep per world")
+                raise ConfigError(f"{self.name}: the model has {kind}; the engines do not keep their state per world")
         return model
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:

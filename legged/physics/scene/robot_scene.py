@@ -28,7 +28,7 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     for geom in spec.geoms:
         if geom.name in robot.shape_names:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
-            if geom.priority < 1:  # otherwise MuJoCo takes the larger friction of the two shapes
+            if geom.priority < 1:  # without priority, MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
     if not self_collisions:
         for pair in list(spec.pairs):  # explicit pairs collide whatever their types are
@@ -38,8 +38,8 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
 
 
 def robot_source(robot: Robot, self_collisions: bool) -> str:
-    """Return the robot as MJCF for an engine that reads it itself: the path of its file, or a text if `robot_spec` changes
-    the file.
+    """Return the robot as MJCF for an engine that parses MJCF: the path of the robot's file, or a text if `robot_spec`
+    changes the robot.
     """
     own = robot_spec_of(robot.model_path)
     before = _settings(own, robot)
@@ -66,8 +66,8 @@ def _settings(spec: mujoco.MjSpec, robot: Robot) -> tuple[dict[str, tuple[int, i
 
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
-    """Return the first column, and the column after the last, of the contact sensors in sensordata. They are contiguous, 3
-    per shape.
+    """Return the range of the contact sensors' columns in sensordata: its start, and its end, which is excluded. Each shape
+    has 3 adjacent columns.
     """
     start = int(model.sensor(f"contact_{robot.shape_names[0]}").adr[0])
     return start, start + 3 * len(robot.shape_names)
@@ -85,10 +85,9 @@ class RobotScene(Scene):
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
         robot, terrain = self.robot, self.terrain
         spec = robot_spec(robot, sim.self_collisions)
-        spec.compiler.discardvisual = True  # images are rendered from a model of their own
+        spec.compiler.discardvisual = True  # pictures are rendered from another model
         set_options(spec.option, sim)
-        # Contacts with the ground need no larger condim than the robot's own 3. Friction is the robot's, since its shapes
-        # have priority.
+        # The ground keeps the default condim and friction. Contacts take both from the robot's shapes, which have priority.
         if terrain is None or ground == "none":
             touches = terrain is None
             spec.worldbody.add_geom(
@@ -114,5 +113,5 @@ class RobotScene(Scene):
         return spec.compile()
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:
-        """Return the robot's collision shapes, in its order, (S,). Their friction is that of its contacts with the ground."""
+        """Return the robot's collision shapes (S,), in the robot's order. Contacts with the ground have their friction."""
         return np.array([model.geom(name).id for name in self.robot.shape_names])

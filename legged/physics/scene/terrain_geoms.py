@@ -11,11 +11,11 @@ from legged.terrain.height_map import CORNERS, HeightMap
 from legged.terrain.terrain import Terrain
 
 DEPTH = 20.0
-"""Depth of all geoms below the lowest point of the map [m]. It is so large that nothing slips between two geoms. A height
-field's points that are sunk to this depth lean its flanks by less than 1 mm for each 0.2 m of a face."""
+"""Depth of all geoms below the lowest point of the map [m]. It is so large that nothing slips between two geoms. Where
+points of a height field are sunk to this depth, its flanks lean by less than 1 mm for each 0.2 m of a face."""
 SKIN = 0.05
-"""Distance by which colliding height fields lie below the ground, measured along its normal; MuJoCo's margin makes them
-collide at the same distance above themselves [m].
+"""Distance by which colliding height fields lie below the ground, measured along the ground's normal [m]. MuJoCo's margin
+makes them collide at this distance above their surface.
 
 MuJoCo treats a height field as adjacent prisms, each of which is solid down to its base. A small foot that sinks below their
 tops at an impact is pushed out of one prism sideways into the next, and gets stuck. The margin keeps the foot above the
@@ -43,7 +43,7 @@ def add_terrain(
     Args:
         spec: model that the geoms are added to.
         terrain: the terrain.
-        rows: rows of tiles, without gaps; all by default. The border is included on the sides that they reach.
+        rows: adjacent rows of tiles; all by default. The border is included next to the first and last row of the terrain.
         cols: columns of tiles, in the same way.
         material: name of a material in `spec`.
         collide: False for geoms that are only rendered.
@@ -170,24 +170,24 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
     for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     for sloped in _layers(corners, ~flat):
-        # Slopes among steps have no skin, since it would stick out beside vertical faces. Points that no slope uses are sunk
-        # to the floor: the surface that hangs down to them lies inside the boxes.
+        # Slopes among steps have no skin, because it would stick out next to vertical faces. Points that no slope uses are
+        # sunk to the floor, so that the surface that leads down to them lies inside the boxes.
         i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(sloped))
         points = _lattice(corners[i, j], sloped[i, j])[0]
         add.surface(x.start + i.start, y.start + j.start, np.where(np.isnan(points), add.floor, points))
 
 
 def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield sets of cells (X, Y) that together are the `sloped` cells. One height field can hold each set: its cells agree in
-    the points that they share, and the field does not stick out above any other cell.
+    """Yield sets of cells (X, Y) that together are the `sloped` cells. Each set fits one height field: the cells of a set
+    agree in the points that they share, and the field does not stick out above any other cell.
 
-    The first set leaves out all cells around two kinds of points: those at which slopes disagree, and those above a lower
-    cell of which the field would contain three corners or more, such as a cell that slopes surround. These cells are
-    distributed over further sets, in which any two cells are separated by two others.
+    The first set leaves out all cells around two kinds of points. At the first kind, slopes disagree. The second kind lies
+    above a lower cell of which the field would contain three corners or more, for example because slopes surround it. The
+    cells that are left out are distributed over further sets, in which any two cells are separated by two others.
     """
     points, bad = _lattice(corners, sloped)
     used = [~np.isnan(own) for own in _at_corners(points)]
-    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # three corners, or two diagonally opposite ones
+    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # any three corners include two opposite ones
     for k, (top, is_bad) in enumerate(zip(_at_corners(points), _at_corners(bad), strict=True)):
         is_bad |= covers & (top > corners[:, :, k] + SAME)
     alone = sloped & np.any(_at_corners(bad), axis=0)
@@ -207,9 +207,9 @@ def _at_corners(points: np.ndarray) -> list[np.ndarray]:
 
 def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean (X + 1, Y + 1) of the corners (X, Y, 4) of cells at each lattice point [m], and a mask of the points at
-    which they differ.
+    which the corners differ.
 
-    With `used` (X, Y), only those cells count. The mean is NaN at points without such cells.
+    With `used` (X, Y), only used cells count. The mean is NaN at points without used cells.
     """
     shape = (corners.shape[0] + 1, corners.shape[1] + 1)
     total, number = np.zeros(shape), np.zeros(shape)
@@ -237,9 +237,9 @@ def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tu
     """Yield rectangles and their heights [m] that together cover all flat cells of heights `low` (X, Y) [m].
 
     Boxes are solid, so a box may extend below higher cells: a pyramid becomes a stack of plates. Boxes that are only rendered
-    do not overlap. Boxes that collide overlap those of equal height (`overlap`): at a seam between boxes, a foot that sinks
-    in would be pushed sideways into the next box. The method is greedy: the lowest cell that is still uncovered takes the
-    larger of two rectangles, one grown along x first and one along y first.
+    do not overlap. Boxes that collide overlap those of equal height (`overlap`), because at a seam between boxes, a foot that
+    sinks in would be pushed sideways into the next box. The method is greedy: the lowest cell that is still uncovered takes
+    the larger of two rectangles. One of them is extended along x first, the other along y first.
     """
     open_cells = flat.copy()
     while open_cells.any():

@@ -1,7 +1,7 @@
-"""Kernel of actuators with friction, delay and a torque-speed curve; legged/mdp/actuator.py has the same formulas in torch,
-and their sources.
+"""Kernel of actuators with friction, delay and a torque-speed curve. For the same formulas in torch, and for their sources,
+see legged/mdp/actuator.py.
 
-The kernel has a module of its own, so that it is not compiled for trainings with ideal motors.
+The kernel has a separate module, so that training with ideal motors does not compile it.
 """
 
 import warp as wp

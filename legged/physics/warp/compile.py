@@ -183,7 +183,7 @@ class _Lock:
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            unlock_descriptor(self._file.fileno())  # closing is not enough while a child has it open
+            unlock_descriptor(self._file.fileno())  # closing does not release it while a child has the file open
         self._file.close()
 
     def acquire(self) -> bool:
@@ -195,7 +195,7 @@ class _Lock:
 
 
 class Line:
-    """Progress on one line of a terminal. Without a terminal, plain lines at intervals."""
+    """Progress on one line of a terminal. Without a terminal, a new line is printed every few seconds."""
 
     def __init__(self, total: int) -> None:
         self._total, self._start, self._shown = total, time.monotonic(), -math.inf
@@ -218,7 +218,7 @@ class Line:
 
     def end(self, done: int) -> None:
         """Show that `done` modules were compiled. Warp compiles the others at their launch, and reports their errors."""
-        rest = "" if done == self._total else f" of {self._total}; the others are compiled when they are launched"
+        rest = "" if done == self._total else f"; the other {self._total - done} are compiled when they are launched"
         self._print(f"compiled {done} kernel modules in {time.monotonic() - self._start:.1f} s{rest}")
 
     def _print(self, text: str) -> None:

@@ -66,8 +66,8 @@ def sum_contact_forces(
     contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """Sum the contact forces on each shape in one launch, for worlds that have `slots` contacts of their own. `lanes` threads
-    per world: each computes the force of one contact, and then the sum on one shape.
+    """Sum the contact forces on each shape in one launch, for worlds with `slots` contacts each. `lanes` threads per world:
+    each computes the force of one contact, and then the sum on one shape.
 
     With elliptic cones, rows hold the force along the axes of the contact frame. With pyramids, they hold the forces along
     the edges, each of which is the normal plus or minus friction times a tangent.

@@ -25,8 +25,8 @@ class Launcher:
     ) -> None:
         """Launch a kernel. The first `vectors` of its arguments are arrays of vectors (..., 3).
 
-        On a CPU the launch is recorded for the next step, whose tensors are the same: preparing a launch takes longer than
-        running it.
+        On a CPU the launch is recorded, because preparing it takes longer than running it. The next step replays it if its
+        tensors are the same.
         """
         with self._on_device():
             key = None
@@ -38,14 +38,14 @@ class Launcher:
             inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
             wp.launch(kernel, dim=dim, inputs=inputs)
             if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                # the recorded launches belong to tensors that each step creates anew
+                # If the table is full, its launches belong to tensors that each step creates anew, so they are useless.
                 if len(self._prepared) >= MOST_PREPARED:
                     self._prepared.clear()
                 self._prepared[key] = prepared
 
 
 def _identity(argument: Tensor | float) -> Any:
-    """Return the properties of an argument by which a kernel distinguishes it from others."""
+    """Return a number itself, and for a tensor the properties that a recorded launch depends on."""
     if isinstance(argument, Tensor):
         return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
     return argument

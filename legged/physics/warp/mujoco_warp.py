@@ -34,7 +34,7 @@ from legged.robots.reserved_names import FLOOR
 from legged.robots.robot_model import disabled_groups
 
 PER_WORLD = ("geom_friction", "body_mass", *DERIVED)
-"""Arrays of the model that always have one row per world; the arrays of randomised fields have one too."""
+"""Arrays of the model that always have one row per world. Arrays of randomised fields also have one row per world."""
 
 
 def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> int:
@@ -54,7 +54,7 @@ def absent_stages(model: mujoco.MjModel, randomized: Collection[str] = ()) -> in
 
 
 def ignored(model: mujoco.MjModel) -> str:
-    """Return the first feature of a model that mujoco-warp ignores silently; empty without such a feature."""
+    """Return the first feature of a model that mujoco-warp would ignore silently, or an empty text."""
     for group in disabled_groups(model):
         return f"it would ignore that the model disables the actuators of group {group}"
     scalar = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE))
@@ -71,7 +71,7 @@ def ignored(model: mujoco.MjModel) -> str:
 
 
 class NoBlocks(Exception):
-    """A model's step cannot run in blocks of worlds. Only the block step is faster on a CPU than the C engine."""
+    """Error for a model whose step cannot run in blocks of worlds. On a CPU, only blocks are faster than the C engine."""
 
 
 class MujocoWarpPhysics(WarpPhysics):
@@ -102,7 +102,7 @@ class MujocoWarpPhysics(WarpPhysics):
         if sim.step != "library":
             ask_for_dense_rows(self.model)
         for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
-            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo computes this in each step, mujoco-warp does not
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo does this in each step, mujoco-warp does not
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
@@ -111,7 +111,7 @@ class MujocoWarpPhysics(WarpPhysics):
         """Names of the model arrays with one row per world."""
         with wp.ScopedDevice(self._wp_device):
             self._m = self._put_model(scene.name)
-            self._m.opt.warn_overflow = 0  # counted in refresh instead of printed by each thread
+            self._m.opt.warn_overflow = 0  # `refresh` counts overflows; a warning would be printed by each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             self._on_cells: TerrainContact | None = None
             if terrain is not None and cells:
@@ -271,7 +271,7 @@ class MujocoWarpPhysics(WarpPhysics):
         mjw.set_const(self._m, self._d)
 
     def _captured_step(self) -> Callable[[], Any]:
-        """Record a step, and restore the state from before it. Return the function that replays it."""
+        """Record a step, then restore the state that preceded it. Return a function that replays the step."""
         start = [tensor.clone() for tensor in (self.qpos, self.qvel)]
         recorded = self._record_step()
         for tensor, value in zip((self.qpos, self.qvel), start, strict=True):
@@ -288,7 +288,7 @@ class MujocoWarpPhysics(WarpPhysics):
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        # the state comes from a version whose solver did not keep the active set
+        # A state without "last_rows" comes from a version whose solver did not keep the active set.
         if self._contacts is not None and "last_rows" not in saved:
             saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.active_set.last))}
         super().load_state(saved)

@@ -1,7 +1,7 @@
-"""Learned actuators in one launch per physics step; legged/mdp/actuator_network.py has the same in torch, and describes them.
+"""Learned actuators in one launch per physics step. legged/mdp/actuator_network.py describes them and has them in torch.
 
-Each thread computes one joint of one robot. Its units lie in a column of `scratch`, so that neighbouring threads read
-adjacent numbers.
+Each thread computes one joint of one robot. The network's units lie in a column of `scratch`, so that neighbouring threads
+read adjacent numbers.
 """
 
 import warp as wp

@@ -20,7 +20,7 @@ from legged.physics.warp.task_kernels import TaskKernels
 
 class WarpPhysics(Physics):
     """N worlds in an engine written in Warp. All tensors are on one device, at fixed addresses, so that a step can be
-    captured. On the CPU, this class captures the step by Warp.
+    captured. On the CPU, this class records the step as a Warp graph.
 
     A subclass sets `model`, `qpos`, `qvel`, `ctrl`, `robot_state` and `_state_io`, and implements `_step` with Warp launches
     only.
@@ -47,7 +47,7 @@ class WarpPhysics(Physics):
 
     def _record_step(self) -> Callable[[], Any]:
         """Return a function that replays the step as a Warp graph on the CPU: the same arithmetic without the cost of
-        launching from Python. This runs the step once, which compiles it; recording does not execute it.
+        launching from Python. The step runs once before the recording, which compiles its kernels.
         """
         with wp.ScopedDevice(self._wp_device):
             self._step()
@@ -57,7 +57,7 @@ class WarpPhysics(Physics):
 
     def _on_device(self) -> AbstractContextManager[Any]:
         """Return a context in which Warp launches on this engine's device and on torch's current stream, so that launches of
-        both stay in order, also during a capture.
+        Warp and torch stay in order, also during a capture.
         """
         stack = ExitStack()
         stack.enter_context(wp.ScopedDevice(self._wp_device))
@@ -77,7 +77,7 @@ class WarpPhysics(Physics):
 
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
-        if not forces_read:  # read forces once per step, since a reset after that has cleared those of its worlds
+        if not forces_read:  # read forces once per step, because a later reset clears those of its worlds
             with self._forces_stream.fork(), self._on_device():
                 self._state_io.contact_forces()
         with self._on_device():

@@ -1,7 +1,7 @@
-"""Kernels that resample randomised values within a step, push robots, and change height-map errors; legged/mdp has the same
-in torch.
+"""Kernels that resample randomised values within a step, push robots, and change height-map errors. legged/mdp has the same
+formulas in torch.
 
-The kernels have a module of their own, so that it is not compiled for trainings without randomisation.
+The kernels have a separate module, so that training without randomisation does not compile them.
 """
 
 import warp as wp
@@ -23,7 +23,7 @@ def find_moments(
     chosen_due: wp.array[wp.bool],
 ):
     """Find the values that must be resampled now. One thread per robot. Column 0 of `due` means never, column 1 a reset, and
-    the others the ends of intervals. At `chosen_at` another model variant is chosen; 0 means never.
+    the others the ends of intervals. When column `chosen_at` is due, another model variant is chosen.
     """
     robot = wp.tid()
     something = wp.bool(reset[robot])
@@ -125,7 +125,7 @@ def vary_control(
     damping, torque limit and default angle of each joint.
     """
     robot, joint = wp.tid()
-    # All reads precede all writes: the compiler moves no read ahead of a write, so each read would wait for memory by itself.
+    # All reads precede all writes, so that they wait for memory together: the compiler moves no read ahead of a write.
     p = nominal[0, joint] * p_gain[robot, joint]
     d = nominal[1, joint] * d_gain[robot, joint]
     most = nominal[2, joint] * torque_limit[robot, joint]

@@ -17,8 +17,8 @@ HOW = {"set": 0, "add": 1, "scale": 2}
 BOUNCE = {"": 0, "ratio": 1, "inverse": 2}
 ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.constant(BOUNCE["inverse"])
 THREADS = 128
-"""Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. One thread per number of
-all worlds would mostly be idle, and a single warp per world would wait about ten times for the data of a number."""
+"""Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. With one thread per
+number and world, most threads would be idle. A single warp per world would wait about ten times for the data of a number."""
 MOST_ARRAYS = 14
 """Largest number of arrays that one launch writes. All fields together need fewer."""
 
@@ -163,8 +163,8 @@ class Redraws:
     def __init__(
         self, of: RandomizedModel, drawn: Tensor, columns: Mapping[str, slice], arrays: Mapping[str, Tensor]
     ) -> None:
-        """Prepare to write `arrays`, (N, ...) each, from `drawn` (N, V), whose `columns` of each field are given. Warp's
-        current device must be that of the tensors.
+        """Prepare to write `arrays`, (N, ...) each, from `drawn` (N, V). `columns` gives the columns of each field in
+        `drawn`. Warp's current device must be that of the tensors.
         """
         changes: dict[tuple[int, int], list[tuple[int, int, int, float]]] = {}
         own = []
@@ -205,7 +205,7 @@ class Redraws:
 
 
 class Variants:
-    """Model variants with derived constants, one of which each world takes."""
+    """Model variants with derived constants. Each world takes one of them."""
 
     def __init__(self, arrays: Mapping[str, tuple[Tensor, Tensor]]) -> None:
         """Keep, for each array, the variants (K, ...) and the worlds' array (N, ...). Warp's current device must be that of
@@ -224,7 +224,7 @@ class Variants:
         return torch.cat([array.reshape(len(array), -1) for array in made.values()], dim=1).contiguous()
 
     def replace(self, made: Mapping[str, Tensor]) -> None:
-        """Replace the variants in place by as many others."""
+        """Overwrite the variants in place with the same number of new ones."""
         self._variants.copy_(self._side_by_side(made))
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:

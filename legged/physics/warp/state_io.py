@@ -193,7 +193,7 @@ class StateIO:
         wp.launch(read_flags, dim=len(self._overflowed), inputs=inputs, outputs=[self._overflowed])
 
     def contact_forces(self) -> None:
-        """Read the contact forces of tracked shapes from the last step. Does nothing without a robot."""
+        """Read the contact forces of tracked shapes from the last step. Without a robot, this does nothing."""
 
 
 class RobotStateIO(StateIO, ABC):
@@ -246,7 +246,7 @@ class MujocoWarpStateIO(RobotStateIO):
         state: RobotState,
         slots: int = 0,
     ) -> None:
-        """Prepare for mujoco-warp's model `m` and data `d`. `slots` is the number of contacts that each world has for itself
+        """Prepare for mujoco-warp's model `m` and data `d`. `slots` is the number of contacts that each world has room for
         (`ContactStage`), or 0 if all worlds share a pool. Warp's current device must be that of `m` and `d`.
         """
         super().__init__(arrays_of(d), overflowed, model, robot, state)

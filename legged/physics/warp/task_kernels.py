@@ -275,7 +275,7 @@ def add_rewards(
     total: wp.array[float],
 ):
     """Add up rewards. One thread per robot; rows are terms. Terms are processed in groups of four, so that all reads of a
-    group precede its writes: the compiler moves no read ahead of a write, so each read would wait for memory by itself.
+    group precede its writes and wait for memory together: the compiler moves no read ahead of a write.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -308,8 +308,8 @@ class TaskKernels(Launcher):
     """Launches of task kernels on an engine's device, on torch's current stream. All array arguments are torch tensors."""
 
     def name_module(self) -> None:
-        """Launch one kernel of this module. A dry run calls it to find the modules that are needed; all kernels here are in
-        one module.
+        """Launch one kernel of this module. A dry run, which finds the modules to compile, calls this method. All kernels
+        here are in one module.
         """
         wp.launch(hold_joints, dim=1)
 
