@@ -1,5 +1,5 @@
-"""Counting of trainings that share a device: each holds a file lock that the others see, so that its report can state their
-number.
+"""Count of the trainings that share a device, for the report of each. Every training holds a file lock, which the others
+see.
 """
 
 import contextlib
@@ -15,21 +15,21 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts; otherwise its attempts on the locks would look like trainings."""
+"""File that a process locks while it counts. Otherwise the locks that it tries could look like trainings."""
 PAUSE_S = 1.0
-"""Least interval between two counts during a training [s]."""
+"""Shortest time between two counts during a training [s]."""
 
 
 class Neighbours:
-    """The other trainings on one device, of any user and however started; a context in which this training is one of them.
+    """The other trainings on one device, of all users. In its context the others can see this training.
 
-    A lock ends with the process that holds it, however that ends. Trainings of another machine, or of a container with
+    The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a container with
     separate temporary files, are not seen.
     """
 
     def __init__(self, device: str) -> None:
-        """Take the unique name of the `device` on this machine, such as a GPU's UUID. It does not depend on the numbers that
-        processes give to devices.
+        """Take the unique name of the `device` on this machine, such as a GPU's UUID. An index would not
+        do, because processes may number the devices differently.
         """
         self.most = 0
         """Largest number of other trainings seen at one time."""
@@ -39,7 +39,7 @@ class Neighbours:
         self._looked_s = 0.0
 
     def __enter__(self) -> "Neighbours":
-        with contextlib.suppress(OSError):  # in a folder that can't be written, others do not see this training
+        with contextlib.suppress(OSError):  # if the folder can't be written, others do not see this training
             self._join()
         self.look()
         return self
@@ -61,7 +61,7 @@ class Neighbours:
         self._lock = os.fdopen(descriptor, "wb")
         os.chmod(name, 0o644)
         lock_descriptor(descriptor, blocking=False)
-        self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
+        self._path = Path(name).rename(f"{name}{ENDING}")  # other processes see the file only now, with its lock
 
     def glance(self) -> None:
         """Count the others, unless the last count was a moment ago."""
