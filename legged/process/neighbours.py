@@ -15,7 +15,7 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts. Otherwise the locks that it tries could look like trainings."""
+"""File that a process locks while it counts. The locks that it tries would otherwise look like trainings."""
 PAUSE_S = 1.0
 """Shortest time between two counts during a training [s]."""
 
@@ -23,8 +23,8 @@ PAUSE_S = 1.0
 class Neighbours:
     """The other trainings on one device, of all users. In its context the others can see this training.
 
-    The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a container with
-    separate temporary files, are not seen.
+    The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a
+    container with separate temporary files, are not seen.
     """
 
     def __init__(self, device: str) -> None:

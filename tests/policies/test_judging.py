@@ -244,7 +244,7 @@ def test_policies_that_cannot_be_played(tmp_path):
         ({"control_type": "V"}, "control_type: got 'V'"),
         ({"recurrent": memory}, "has a memory"),
         ({"observation_groups": [{**group, "history": 3}]}, "has a memory"),
-        ({"observation": uneven}, "columns of 'base_lin_vel' have scales of their own"),
+        ({"observation": uneven}, "the columns of 'base_lin_vel' have different scales"),
         ({"observation": [heights, *terms[1:]]}, "there is no term 'heights'"),
         ({"damping": None}, "is no policy.json"),
     ):
