@@ -201,7 +201,7 @@ class Output:
 
     def __init__(self, stream: TextIO | None) -> None:
         """Wrap `stream`, which is None in a process that was started without one."""
-        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (stays open until the process ends)
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (open until the process ends)
         self.lost: str | None = None
         """Reason why nothing more can be written; None while writing works."""
         self._when_lost: list[Callable[[], object]] = []

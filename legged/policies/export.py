@@ -199,8 +199,8 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
 
 
 def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
-    """Return the file of weights of `policy`, rsl-rl's actor network on the CPU. `activation` is rsl-rl's name for that of the
-    hidden layers. Of the outputs only the means of the actions are kept.
+    """Return the file of weights of `policy`, rsl-rl's actor network on the CPU. `activation` is rsl-rl's name for the
+    activation of hidden layers. Of the outputs only the means of the actions are kept.
     """
     layers: list[Layer] = []
     if policy.obs_normalization:

@@ -121,7 +121,7 @@ def _layout_of(contract: Contract) -> Layout:
     """Return the layout of an exported policy, which must observe a single step, with one scale for each term."""
     path = contract.path
     if contract.states or any(group.history != 1 for group in contract.groups):
-        raise ConfigError(f"{path}: the policy has a memory or a history; only policies that observe a single step can be played here")
+        raise ConfigError(f"{path}: the policy has a memory or a history; only policies without both can be played here")
     observation: dict[str, float] = {}
     for term in contract.terms:
         halves = dict(zip(COMMANDS, (term.scale[:2], term.scale[2:]), strict=True))
