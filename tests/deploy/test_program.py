@@ -105,7 +105,7 @@ def test_one_that_halts_can_walk_on_and_can_be_stopped(stage):
     said = [
         "walk: the robot halts, and then stands",
         "walk: the robot walks on",
-        "walk: it halts, and then stands",
+        "walk: the robot halts, and then stands",
         "stop: operator: stop",
     ]
     assert stage.program.log.notes[3:7] == said

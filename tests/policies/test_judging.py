@@ -172,7 +172,7 @@ def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys
     command = ["--command", "0,0,0", "--seconds", "2.1"]
     assert call(evaluate_onnx.main, [str(policy), *command]) == 0
     said = capsys.readouterr().err
-    assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
+    assert ("policy.json: the policy was trained with other motors" in said) == warns
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ LISTENING = "listening at "
 REPORT, POSES = "report.json", "poses.npy"
 """Files in the folder of a run."""
 PRIORITY = 10
-"""Priority below the program's."""
+"""Real-time priority (1 to 99). The program's priority is higher."""
 BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 
@@ -53,11 +53,11 @@ SIMULATION = (
     arguments=(
         argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
         *SIMULATION,
-        argument("--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"),
+        argument("--contract", type=Path, help="policy.json that defines motors and height map; ideal motors without it"),
         argument(
             "--out",
             type=Path,
-            help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute",
+            help=f"folder for {REPORT} and {POSES}, the poses of the first 30 s at 25 Hz",
         ),
         argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600"),
     ),
@@ -65,9 +65,9 @@ SIMULATION = (
 def robot(args: argparse.Namespace) -> int:
     """Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
 
-    C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
-    packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT`
-    runs a policy on it.
+    C MuJoCo simulates the robot in real time on this machine, with its own time step, and a simulated network may delay and
+    lose packets. The command prints the port at which it listens.
+    `python -m legged.deploy exported --robot udp:127.0.0.1:PORT` runs a policy on the robot.
     """
     check_simulation(args)
     if not args.seconds > 0.0:
@@ -80,7 +80,7 @@ def robot(args: argparse.Namespace) -> int:
     contract = None if args.contract is None else read_contract(args.contract)
     (rotored, motors), scan = motors_of(args, loaded, contract), scan_of(contract)
     server = Server(SimulatedRobot(rotored, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
-    take_priority(PRIORITY)  # motors and sensors of a real robot do not wait for other processes either
+    take_priority(PRIORITY)  # a real robot's motors and sensors do not wait for other processes
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
     if args.out is not None:
@@ -110,8 +110,8 @@ def check_simulation(args: argparse.Namespace) -> None:
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
-    """Return the robot with the motors, rotors and control laws that the flags choose; by default those of the training of
-    the policy in `contract`.
+    """Return the robot with the motors, rotors and control laws that the flags choose; by default those with which the
+    policy in `contract` was trained.
 
     Raises:
         ConfigError: as `motors_config`.

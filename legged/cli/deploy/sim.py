@@ -33,7 +33,7 @@ from legged.terrain import Terrain
 ROOM_MB = 16.0
 """Disk space for the exported policy and the log [MiB]."""
 END_S = 20.0
-"""Longest time for a process to end after it was told to [s]."""
+"""Longest time that a process may take to end [s]."""
 DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
 """Exit codes of a program that did not move the robot."""
 FILM = "film.mp4"
@@ -87,8 +87,8 @@ def sim(args: argparse.Namespace) -> int:
 
 
 def _exported(name: str) -> Path:
-    """Return the folder of the exported policy `name`. A run whose newest checkpoint was not exported is exported first, and
-    so is a shipped policy.
+    """Return the folder of the exported policy `name`. A shipped policy, or a run whose newest checkpoint was not exported,
+    is exported first.
     """
     given = Path(name).parent if name.endswith(".onnx") else Path(name)
     if exists(given / "policy.onnx"):
@@ -100,7 +100,9 @@ def _exported(name: str) -> Path:
             return given / EXPORTED
     policy = policy_of(name)
     if not isinstance(policy.cfg, LeggedConfig):
-        raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
+        raise ConfigError(
+            f"POLICY: '{policy.cfg.task}' follows no commands; the program needs a policy of a legged robot that does"
+        )
     folder = policy.output("deploy") / EXPORTED
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
@@ -110,8 +112,8 @@ def _exported(name: str) -> Path:
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
-    """Return the simulated robot: the one `given`, else the policy's. A contract names a user-defined robot without its
-    folder, which is in the configuration of the run that contains the export.
+    """Return the simulated robot: the one `given`, else the policy's. A contract names a robot without its folder. The folder
+    of a user-defined robot is in the configuration of the run that contains the export.
     """
     if given is not None:
         return load_robot(given, "--robot")
@@ -143,7 +145,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # Ctrl-C is for the program, which stops the robot safely first
+        start_new_session=True,  # Ctrl-C must reach only the program, which stops the robot safely
     )
     program = None
     if in_main_thread():  # a signal to this process ends the other two as well
@@ -162,7 +164,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         try:
             simulator.communicate(timeout=END_S)
         except subprocess.TimeoutExpired as error:
-            raise RunError("the simulated robot did not hear the program's goodbye") from error
+            raise RunError("the simulated robot did not end after the program") from error
         if simulator.returncode:
             raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
     finally:
@@ -201,7 +203,7 @@ def _told(report: dict[str, Any]) -> str:
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
-    """Write a film of the poses in `folder` with the states of its log.npz; fewer than two poses make no film.
+    """Write a film of the poses in `folder` with the states of its log.npz; no film if there are fewer than two.
 
     Raises:
         RunError: this machine cannot render, or the film cannot be written.
@@ -209,7 +211,7 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
     poses = np.load(folder / POSES)
     log = np.load(folder / "log.npz")
     if len(poses) < 2 or "times" not in log:
-        (folder / FILM).unlink(missing_ok=True)  # left by another run
+        (folder / FILM).unlink(missing_ok=True)  # another run may have left it
         print(f"{folder}: no film, because the run was too short")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
