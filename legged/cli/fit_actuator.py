@@ -213,7 +213,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
 
 
 def _shown(log: ActuatorLog) -> np.ndarray:
-    """Return the indices of the first held-out samples of a log, up to the end of their run and `SHOWN_S`."""
+    """Return the indices of the held-out samples of one run within `SHOWN_S` of the first one."""
     held = log.held_out
     start = int(np.flatnonzero(held)[0])
     rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))

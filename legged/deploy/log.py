@@ -16,7 +16,7 @@ from legged.process.paths import make_folder, replacing
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Numbers of rows that are kept, the newest: twenty minutes at 250 readings and 50 cycles per second, some 100 megabytes."""
+"""Numbers of newest rows that are kept: 20 minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
 SHORTEST = 20
 """Smallest number of samples without a gap that is used for fitting."""
 UNEVEN = 0.75
@@ -103,7 +103,7 @@ class Log:
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
-    """Return the samples for fitting in a log (arrays of `Log.save`); None if there are none. They are the evenly spaced
+    """Return the samples for fitting from a log (arrays of `Log.save`); None if it has too few. They are the evenly spaced
     readings with the policy's gains and with torques.
 
     A missing reading ends a run; repeated readings are left out. The arrays are `joint_names` (D,), `run` (T,), `dt` [s],

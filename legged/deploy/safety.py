@@ -13,7 +13,7 @@ SLOWEST_FALL = 0.5
 AT_ONCE = 2.0
 """Factor on the allowed joint speed above which the robot is stopped at once."""
 MOST_DAMPING = 4.0
-"""Largest D gain for braking, as a multiple of the policy's D gain, at which the motors are known to be stable."""
+"""Largest D gain for braking, as a multiple of the policy's D gain, because motors may be unstable far above that gain."""
 
 
 @dataclass(frozen=True)

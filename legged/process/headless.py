@@ -73,7 +73,7 @@ def off_screen_library() -> str | None:
 
 def choose() -> None:
     """Set MUJOCO_GL on a machine without a display, unless the user has set it; check the user's value. If the user's
-    library is missing, pictures are switched off with a warning: MuJoCo could not be imported otherwise, and most commands
+    library is missing, MuJoCo could not be imported. So pictures are switched off with a warning, because most commands
     draw nothing.
 
     Raises:
