@@ -327,7 +327,7 @@ def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]
     names = [entry["name"] for entry in said["observation_groups"]]
     for entry in said["observation"]:
         if entry["group"] not in names:
-            raise ConfigError(f"{where}: '{entry['name']}' is in the group '{entry['group']}', which the groups lack")
+            raise ConfigError(f"{where}: the group '{entry['group']}' of '{entry['name']}' does not exist")
     start = 0
     for entry in said["observation_groups"]:
         size, history, column = int(entry["size"]), int(entry["history"]), start

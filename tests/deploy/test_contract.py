@@ -113,7 +113,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ),
         (
             {"observation_groups": [{"name": "other", "start": 0, "size": 45, "history": 2}]},
-            r"observation: 'base_ang_vel' is in the group 'actor', which the groups lack",
+            r"observation: the group 'actor' of 'base_ang_vel' does not exist",
         ),
     ],
 )
