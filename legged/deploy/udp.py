@@ -139,7 +139,7 @@ def unpack_state(body: bytes, received: float) -> Reading:
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(str(error)) from error
     if place != len(body):
-        raise ValueError("it is too long")
+        raise ValueError("its length is wrong: it is too long")
     q, dq, torques = numbers[7:].reshape(3, count)
     return Reading(moment, received, numbers[:4], numbers[4:7], q, dq, torques, sources=found)
 

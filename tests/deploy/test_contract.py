@@ -126,7 +126,7 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
     ("changes", "says"),
     [
         ({"name": "my_gyro"}, "'my_gyro' cannot be made from 'gyro'"),
-        ({"needs": "quaternion"}, "'base_ang_vel' needs 'quaternion', which"),
+        ({"needs": "quaternion"}, "'base_ang_vel' cannot be made from 'quaternion'"),
         ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, a robot gives 3"),
         ({"start": 3}, "'base_ang_vel' must start at column 0, got 3"),
     ],
