@@ -1,7 +1,8 @@
 """Many robots walking in one picture: `python docs/make/contact_sheet.py go2_flat h1_flat --out robots.gif`.
 
-Each tile shows the newest run of a task, else its shipped policy; a run folder in place of a task names another policy. The
-robots walk in C MuJoCo on the CPU. A GIF lasts four seconds and has at most 2 MB; a PNG is its middle picture.
+Each tile shows the policy of a task's newest run, or else the task's shipped policy. A run folder in place of a task names
+another policy. The robots walk in C MuJoCo on the CPU. A GIF lasts four seconds and has at most 2 MB. A PNG is the picture
+in its middle.
 """
 
 import sys
@@ -74,7 +75,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def names_of(policies: Sequence[TrainedPolicy]) -> list[str]:
-    """Return the labels of the tiles: the robot, or the task where a robot comes twice, or task and folder.
+    """Return the labels of the tiles: the robot, or the task if the robot comes twice, or task and folder if the task does.
 
     Raises:
         ConfigError: a policy follows no commands.

@@ -23,7 +23,7 @@ SEED_FOLDER = re.compile(r"seed_(\d+)", re.ASCII)
 
 @dataclass(frozen=True)
 class EvaluatedRun:
-    """A training and its evaluations. A failed one may have no folder, times or results."""
+    """A training and its evaluations. A failed training may have no folder, times or results."""
 
     cfg: LeggedConfig
     seed: int
@@ -38,15 +38,15 @@ class EvaluatedRun:
 
 
 def read_run(folder: Path) -> EvaluatedRun:
-    """Read a run folder, or that of a shipped policy. Evaluations of another checkpoint than the last and those with changed
-    fields are left out, with a note. A note also marks evaluations on another grid of commands than the task's.
+    """Read a run folder or the folder of a shipped policy. Evaluations of earlier checkpoints, and evaluations with changed
+    settings, are left out with a note. A note also marks evaluations on another grid of commands than the task's.
 
     Raises:
         ConfigError: the folder is no run folder, its task follows no commands, or a file in it is damaged.
     """
     cfg = run_config(folder)
     if not isinstance(cfg, LeggedConfig):
-        raise ConfigError(f"{relative(folder)}: '{cfg.task}' follows no commands; the table is of tasks that do")
+        raise ConfigError(f"{relative(folder)}: '{cfg.task}' follows no commands; the table has only tasks that do")
     timing = read_timing(folder)
     notes = ["it was resumed, and its times are those of the last part"] if timing and timing.resumed else []
     results = results_in(folder)
@@ -65,7 +65,7 @@ def results_in(folder: Path) -> dict[str, dict[str, Any]]:
     """Return engine -> result of the evaluations in a folder.
 
     Raises:
-        ConfigError: one of them is damaged, or of something else than commands.
+        ConfigError: an evaluation is damaged, or does not measure how a policy follows commands.
     """
     found = {}
     for engine in ENGINES:
@@ -73,7 +73,7 @@ def results_in(folder: Path) -> dict[str, dict[str, Any]]:
         if path.is_file():
             (found[engine],) = read_results([path])
             if "episodes" in found[engine]:
-                raise ConfigError(f"{relative(path)}: is of episodes; the table is of tasks that follow commands")
+                raise ConfigError(f"{relative(path)}: measures episodes, but the table has only tasks that follow commands")
     return found
 
 
@@ -104,7 +104,7 @@ def find_runs(paths: Iterable[Path]) -> list[EvaluatedRun]:
         reasons = {folder: why_not(folder) for folder in folders if folder != path}
         kept = [folder for folder in folders if not reasons.get(folder)] or folders[
             :1
-        ]  # without others, reading the first one raises the reason
+        ]  # if none is left, reading the first one raises the error
         for folder in kept:
             if folder.resolve() not in seen:
                 found += [read_run(folder), *_other_seeds(folder)]
@@ -122,8 +122,8 @@ def why_not(folder: Path) -> str:
     try:
         cfg = run_config(folder)
     except ConfigError as error:
-        return f"for its configuration can't be read ({' '.join(str(error).split())})"
-    return "" if isinstance(cfg, LeggedConfig) else "for their tasks follow no commands"
+        return f"because its configuration can't be read ({' '.join(str(error).split())})"
+    return "" if isinstance(cfg, LeggedConfig) else "because their tasks follow no commands"
 
 
 def _other_seeds(folder: Path) -> list[EvaluatedRun]:

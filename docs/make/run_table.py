@@ -1,4 +1,4 @@
-"""Many trainings in one table: how long each took, and how good its policy is, by task and seed."""
+"""One table of many trainings: duration and quality of the policy, by task and seed."""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ Row = dict[str, Any]
 
 
 def summary(runs: Sequence[EvaluatedRun]) -> list[Row]:
-    """Return plain numbers of each task, in the order of its first run: a row a seed, and the mean over seeds."""
+    """Return plain numbers for each task, in the order of the runs: one row for each seed, and the mean over seeds."""
     tasks = dict.fromkeys(run.cfg.task for run in runs)
     return [_task(task, [run for run in runs if run.cfg.task == task]) for task in tasks]
 
@@ -53,7 +53,7 @@ def _task(task: str, runs: Sequence[EvaluatedRun]) -> Row:
 
 @functools.cache
 def _robot(given: str) -> tuple[str, float | None]:
-    """Return name and standing height [m] of the robot that a configuration names; None for the height if the robot is not
+    """Return name and standing height [m] of the robot that a configuration names. The height is None if the robot is not
     found.
     """
     try:
@@ -64,9 +64,9 @@ def _robot(given: str) -> tuple[str, float | None]:
 
 
 def stairs_height(runs: Sequence[EvaluatedRun]) -> float | None:
-    """Return the height of the steps whose success is stated [m]: the smallest height that every evaluation with stairs
-    measured up and down, and that is at least the share of the base height which the first run's configuration asks for.
-    Return None if there is no such height.
+    """Return the height of the steps for which the table states the success [m]. It is the smallest height that every
+    evaluation with stairs measured up and down, and not below the share of the base height that the first run's
+    configuration demands. Return None if there is no such height.
     """
     cfg = runs[0].cfg
     least = cfg.evaluation.stairs * cfg.rewards.base_height_target - 1e-9
@@ -106,7 +106,7 @@ def _row(run: EvaluatedRun, step: float | None) -> Row:
 
 
 def means(rows: Sequence[Row]) -> Row:
-    """Return the means over seeds, each over the seeds that have the number, and the largest of their worst cells."""
+    """Return the means over seeds, and the worst of their worst cells. A mean leaves out seeds without the number."""
     engines = {}
     for name in ENGINES:
         found = [row["engines"][name] for row in rows if name in row["engines"]]
@@ -126,7 +126,7 @@ def means(rows: Sequence[Row]) -> Row:
 
 
 def _of(values: Sequence[float | None], of: Callable[..., float]) -> float | None:
-    """Return a function of the values that are not None; a value is None if every robot fell early."""
+    """Return `of` the values that are not None. A value is None if every robot fell early."""
     there = [value for value in values if value is not None]
     return of(there) if there else None
 
@@ -135,7 +135,7 @@ def _of(values: Sequence[float | None], of: Callable[..., float]) -> float | Non
 
 
 def markdown(tasks: Sequence[Row]) -> str:
-    """Return a summary as a table of Markdown: for each task its seeds, after their mean if there are several."""
+    """Return a summary as a Markdown table. Each task has a row for each seed, below the mean if it has several seeds."""
     rows = [row for task in tasks for row in (*([task["mean"]] if task["mean"] else []), *task["seeds"])]
     engines = [name for name in ENGINES if any(name in row["engines"] for row in rows)]
     stairs = any(task["stairs"] for task in tasks)

@@ -29,8 +29,8 @@ PICTURES = ("*.png", "*.gif", "*.mp4")
 def ship(runs: Sequence[EvaluatedRun], folder: Path) -> list[str]:
     """Write `folder`/<task>/ for each task, and return a line on each.
 
-    The policy is that of the lowest seed that has finished; the last run of a seed counts. The times, evaluations and stress
-    tests of other seeds are put into seed_<number>/. Files of an earlier shipment are removed.
+    The policy comes from the lowest seed that has finished. If a seed has several runs, the last one counts. The times,
+    evaluations and stress tests of other seeds are put into seed_<number>/. Files of an earlier shipment are removed.
 
     Raises:
         ConfigError: a checkpoint or a stress test can't be read, or a run is already in the folder of its task.
@@ -60,7 +60,7 @@ def ship(runs: Sequence[EvaluatedRun], folder: Path) -> list[str]:
         lines.append(f"{relative(place)}: policy of seed {first}, {len(model) / 1e6:.2f} MB{more}")
         pictures = sorted(path.name for pattern in PICTURES for path in place.glob(pattern))
         if pictures:
-            lines.append(f"{relative(place)}: shows the policy before; draw it anew: {', '.join(pictures)}")
+            lines.append(f"{relative(place)}: pictures show the earlier policy; draw them again: {', '.join(pictures)}")
     return lines
 
 
@@ -68,11 +68,11 @@ def _check_elsewhere(run: Path, place: Path) -> None:
     """Raise a ConfigError if a run is in the folder that it would be shipped to."""
     source, place = run.resolve(), place.resolve()
     if source == place or (source.parent == place and SEED_FOLDER.fullmatch(source.name)):
-        raise ConfigError(f"--ship: {relative(run)} is shipped there already; name another folder, or other runs")
+        raise ConfigError(f"--ship: {relative(run)} is in that folder already; name another folder, or other runs")
 
 
 def _small(checkpoint: Path) -> memoryview:
-    """Return a checkpoint's file without the state of its optimiser, and without the critic if it is large.
+    """Return a checkpoint's file without the state of the optimiser. If the file is too large, the critic is left out too.
 
     Raises:
         ConfigError: the checkpoint can't be read.

@@ -57,7 +57,7 @@ class TableError(Exception):
 
 
 def filled(text: str, shipped: "Shipped") -> str:
-    """Return a page with its tables made anew.
+    """Return a page with new tables.
 
     Raises:
         TableError: a marker names no table or has no end, or a file with numbers is missing.
@@ -149,7 +149,7 @@ ERRORS = ("velocity RMSE [m/s]", "yaw rate RMSE [rad/s]", "falls [%]")
 
 
 def over_seeds(values: Sequence[float]) -> str:
-    """Return the mean of the seeds (lowest to highest); nothing for a single seed."""
+    """Return the mean of the seeds (lowest to highest); '-' for a single seed."""
     return f"{mean(values):.3f} ({min(values):.3f} to {max(values):.3f})" if len(values) > 1 else "-"
 
 
@@ -170,7 +170,7 @@ def stairs(result: Result) -> tuple[float, float]:
 
 
 def crossings(result: Result) -> list[str]:
-    """Return cells with two step heights, the success up, down and over obstacles at each [%], and the robots of each."""
+    """Return cells with two step heights, the success up, down and over obstacles at each [%], and the number of robots."""
     sizes = stairs(result)
     shares = [", ".join(percent(share_at(result, name, size)) for size in sizes) for name in CROSSED]
     return [", ".join(f"{size:.2f}" for size in sizes), *shares, str(result["success"]["robots_per_point"])]
@@ -236,14 +236,14 @@ def _rough_row(shipped: Shipped, task: str) -> list[str]:
 
 
 def real(shipped: Shipped) -> str:
-    """Return the table of tasks for a robot: training, errors and success."""
+    """Return the table of tasks for real robots: training, errors and success."""
     return table(
         ("task", *TRAINING, *ERRORS, *CROSSINGS), [_rough_row(shipped, f"{name}_real") for name in ("anymal_c", "go2")]
     )
 
 
 def real_stress(shipped: Shipped) -> str:
-    """Return the success of the tasks for a robot on stairs under each disturbance of the stress test."""
+    """Return the success of the tasks for real robots on stairs under each disturbance of the stress test."""
     names = {
         "nominal": "nothing",
         "payload": "payload",
@@ -262,7 +262,7 @@ def real_stress(shipped: Shipped) -> str:
 
 
 def stress(shipped: Shipped) -> str:
-    """Return the stress scores of the policies of the ANYmal C, and how many robots failed in some lines."""
+    """Return the stress scores of the policies of the ANYmal C, and the number of robots that failed in some lines."""
     chosen, ground = ("payload", "delay 40 ms", "no map", "together", "everything"), ("dense_blocks", "kerbs", "rubble")
     rows = []
     for task in ("anymal_c", *(f"anymal_c_{name}" for name in TOLD_LESS)):
@@ -308,7 +308,7 @@ def others(shipped: Shipped) -> str:
 
 
 def engines(shipped: Shipped) -> str:
-    """Return the errors of policies of anymal_c_flat in other engines than the one that they were trained in."""
+    """Return the errors of policies of anymal_c_flat in the engine of their training and in other engines."""
     trained_in = {
         "anymal_c_flat": "mujoco-warp (shipped)",
         "anymal_c_flat/newton_mujoco": "newton mujoco",

@@ -1,9 +1,9 @@
 """Train and evaluate many tasks, and put them in one table: `python docs/make/zoo.py go2_flat h1_flat --seeds 1,2,3`.
 
-Each task and seed is trained (logs/<task>/<date_time>_s<seed>) and evaluated in each engine, each in its own process. Their
-output is in logs/zoo/output/, the table in logs/zoo/table.md and table.json. The command skips finished runs of the same
-configuration and evaluations of the same grid and terrain, so it continues where it was stopped. With --table it makes the
-table of existing runs. With --ship it copies the policies as the package ships them.
+Each task is trained with each seed (logs/<task>/<date_time>_s<seed>) and evaluated in each engine, in separate processes.
+Their output is in logs/zoo/output/, the table in logs/zoo/table.md and table.json. The command skips finished runs of the
+same configuration and evaluations of the same grid and terrain, so it continues where it was stopped. With --table it makes
+the table of existing runs. With --ship it copies the policies as the package ships them.
 """
 
 import argparse
@@ -42,7 +42,7 @@ OUT = Path("logs") / "zoo"
 NEWTON = "newton_"
 """Prefix of the names of Newton's solvers in `ENGINES`."""
 MOST_EVALUATIONS = 4
-"""Evaluations on the GPU, and on the cores, that run at once at most."""
+"""Largest number of evaluations that run at once on the GPU, and on the cores."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -61,7 +61,7 @@ def build_parser() -> CommandParser:
     parser.add_argument("tasks", nargs="*", metavar="TASK | key=value", help="tasks, and overrides for all of them")
     parser.add_argument("--seeds", default="1", help="random seeds, e.g. 1,2,3; 1 by default")
     parser.add_argument(
-        "--jobs", type=int, default=1, help="trainings side by side; with 1, the default, times are undisturbed"
+        "--jobs", type=int, default=1, help="trainings at the same time; with 1, the default, times are undisturbed"
     )
     parser.add_argument("--engines", default="mujoco_warp,mujoco", help="engines of the evaluations; mujoco_warp,mujoco")
     parser.add_argument("--robots", type=int, default=ROBOTS, help=f"robots per cell of the command grid; {ROBOTS}")
@@ -111,7 +111,7 @@ class Training:
     seed: int
     cfg: LeggedConfig
     folder: Path | None = None
-    """Its run folder after it has finished."""
+    """Run folder of the finished training; None before."""
     failure: str = ""
     notes: list[str] = field(default_factory=list)
 
@@ -134,7 +134,7 @@ def _plan(args: argparse.Namespace) -> list[Training]:
         ConfigError: an argument is wrong; nothing has been trained then.
     """
     if Ranks.now().several:
-        raise ConfigError("zoo: starts its processes by itself; run it without torchrun")
+        raise ConfigError("zoo: run it without torchrun, because it starts its processes itself")
     for flag in ("jobs", "robots"):
         if getattr(args, flag) < 1:
             raise ConfigError(f"--{flag}: must be at least 1, got {getattr(args, flag)}")
@@ -145,7 +145,7 @@ def _plan(args: argparse.Namespace) -> list[Training]:
     names = list(map(tasks.__getitem__, given))
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"zoo: '{name}' is named twice; each task may come once")
+            raise ConfigError(f"zoo: '{name}' is named twice; name each task once")
     args.on_cpu = pick_device(args.sim_device).type == "cpu"
     args.overrides = ["train.runner.film=false", *(text for text in args.tasks if "=" in text)]
     args.engines = list(dict.fromkeys(name.strip() for name in args.engines.split(",")))
@@ -160,7 +160,7 @@ def _plan(args: argparse.Namespace) -> list[Training]:
 def _config(task: str, args: argparse.Namespace) -> LeggedConfig:
     cfg = task_config(task, map(parse_override, args.overrides), args.on_cpu)
     if not isinstance(cfg, LeggedConfig):
-        raise ConfigError(f"'{task}' follows no commands; the table is of tasks that do")
+        raise ConfigError(f"'{task}' follows no commands; the table has only tasks that do")
     axes_of(cfg)
     if cfg.terrain.mesh_type != "plane":
         chosen_sizes(cfg, args.types, args.full, cfg.terrain.scale)
@@ -177,7 +177,7 @@ def _seeds(text: str) -> list[int]:
         raise ConfigError(f"--seeds: '{text}' is not a list of whole numbers, like 1,2,3")
     numbers = [int(part) for part in parts]
     if len({*numbers}) < len(numbers):
-        raise ConfigError(f"--seeds: '{text}' names one twice; each may come once")
+        raise ConfigError(f"--seeds: '{text}' names a seed twice; name each seed once")
     return numbers
 
 
@@ -193,7 +193,7 @@ def finished_run(cfg: LeggedConfig) -> Path | None:
             shown_alike = replace(trained, evaluation=cfg.evaluation, train=replace(trained.train, runner=runner))
             if shown_alike == cfg and not why_unfinished(path.parent, cfg, read_timing(path.parent)):
                 found.append(path.parent)
-        except ConfigError:  # a run of another version, or a damaged one
+        except ConfigError:  # the run is damaged, or from another version
             continue
     return max(found, key=lambda folder: max(file.stat().st_mtime for file in checkpoints(folder).values()), default=None)
 
@@ -220,7 +220,7 @@ def _is_measured(result: dict[str, Any] | None, training: Training, args: argpar
 
 
 def judged(training: Training, args: argparse.Namespace) -> EvaluatedRun:
-    """Return a training with its evaluations, as far as both have come."""
+    """Return a training with the evaluations that exist so far."""
     notes = tuple(training.notes)
     if training.folder is None:
         return EvaluatedRun(training.cfg, training.seed, failure=training.failure or "not trained yet", notes=notes)
@@ -240,7 +240,7 @@ def training_command(training: Training, args: argparse.Namespace) -> list[str]:
 
 def evaluation_commands(training: Training, engine: str, args: argparse.Namespace, threads: int = 0) -> list[list[str]]:
     """Return the commands that evaluate a finished training in an engine of `ENGINES`: the grid and, for a task with terrain,
-    the terrain. 0 threads are all cores.
+    the terrain. If `threads` is 0, C MuJoCo uses all cores.
     """
     solver = engine.removeprefix(NEWTON)
     common = ["--physics", engine] if solver == engine else ["--physics", "newton", "--solver", solver]
@@ -321,7 +321,7 @@ class _Campaign:
             yield self._evaluation(training, engine, kind, commands)
 
     def _evaluation(self, training: Training, engine: str, kind: Kind, commands: list[list[str]]) -> Job:
-        """Return the job of the first command, after which the others follow."""
+        """Return the job of the first command. When it ends, the jobs of the other commands follow."""
         first, *others = commands
 
         def done(job: Job, code: int) -> list[Job]:
@@ -338,7 +338,7 @@ class _Campaign:
         return "stopped" if self.pool.stopped else why_failed(job, code)
 
     def _written(self, jobs: list[Job]) -> list[Job]:
-        """Write the table as far as it goes; return `jobs`."""
+        """Write the table of the results so far; return `jobs`."""
         _write_table([judged(training, self.args) for training in self.trainings], self.out)
         return jobs
 
@@ -360,7 +360,7 @@ def _write_table(runs: Sequence[EvaluatedRun], out: Path) -> str:
 
 
 def _finish(runs: Sequence[EvaluatedRun], out: Path | None, shipped: Path | None) -> None:
-    """Print the table, write it into `out`, and ship the policies to `shipped`, where these are given."""
+    """Print the table, write it into `out`, and ship the policies to `shipped`, if these folders are given."""
     print(f"\n{markdown(summary(runs)) if out is None else _write_table(runs, out)}", end="", flush=True)
     if out is not None:
         print(f"\nwritten: {relative(out / 'table.md')}, {relative(out / 'table.json')}")

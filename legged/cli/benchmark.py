@@ -54,7 +54,7 @@ GROUNDS: dict[str, list[tuple[str, Any]]] = {
 KILLED = -9
 """Exit code of a process that Linux ended because memory ran out."""
 NO_ROOM = "out of memory"
-"""Result of a size that does not fit into memory."""
+"""Result if a number of robots does not fit into memory."""
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("robots", 12, lambda row: f"{row['num_envs']:,}"),
     ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
@@ -75,7 +75,7 @@ LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": Captured
 
 MEASURED = (
     *TASK,
-    argument("--repeats", type=int, default=5, help="number of measurements; the result is their median; 5 by default"),
+    argument("--repeats", type=int, default=5, help="number of measurements, whose median is the result; 5 by default"),
     argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written"),
 )
 """Arguments of all benchmarks."""
@@ -86,7 +86,7 @@ STEPS = (
 """Arguments of benchmarks of control steps."""
 ITERATIONS = (
     *STEPS,
-    argument("--iterations", type=int, help="of each training loop; 20 by default, 3 on the CPU, 0 for none"),
+    argument("--iterations", type=int, help="training iterations of each loop; 20 by default, 3 on the CPU, 0 for none"),
     argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)"),
     argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it"),
 )
@@ -137,7 +137,7 @@ def without(given: Sequence[str], *flags: str) -> list[str]:
 
 
 def _last_line(text: str, code: int) -> str:
-    """Return the last line of a process's error output, its reason to end with `code`."""
+    """Return the last line of a process's error output, or its exit code `code` if it printed nothing."""
     return (text.strip().splitlines() or [f"exit code {code}"])[-1].removeprefix("error: ")
 
 
@@ -152,7 +152,7 @@ def _write(args: argparse.Namespace, result: Any) -> None:
     "legged benchmark step go2 --num-envs 8192 --policy go2",
     arguments=(
         *ITERATIONS,
-        argument("--kernels", type=int, metavar="COUNT", help="also list this many kernels that take longest (GPU)"),
+        argument("--kernels", type=int, metavar="COUNT", help="also list the COUNT slowest kernels (GPU)"),
     ),
 )
 def step(args: argparse.Namespace) -> int:
@@ -164,9 +164,9 @@ def step(args: argparse.Namespace) -> int:
     """
     cfg, device = _settle(args)
     if args.kernels is not None and device.type != "cuda":
-        raise ConfigError(f"--kernels: needs a GPU, and the task is on {device}")
+        raise ConfigError(f"--kernels: needs a GPU, but the task is on {device}")
     if args.kernels is not None and args.policy is not None:
-        raise ConfigError("--kernels: lists the launches under random actions; leave out either --kernels or --policy")
+        raise ConfigError("--kernels: works only with random actions; leave out either --kernels or --policy")
     settle_on(device)
     count = args.iterations if args.iterations is not None else (3 if device.type == "cpu" else 20)
     policy = None
@@ -195,13 +195,13 @@ def step(args: argparse.Namespace) -> int:
 def scale(args: argparse.Namespace) -> int:
     """Measure speed and memory against the number of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
 
-    Each number is measured as by `legged benchmark step`, in a process of its own, so that each has the memory to itself.
+    Each number of robots is measured as by `legged benchmark step`, in a separate process, so that it has all memory.
     """
     sizes = [part.strip().replace("_", "") for part in args.robots.split(",")]
     if not all(size.isdecimal() and int(size) > 0 for size in sizes):
         raise ConfigError(f"--robots: '{args.robots}' is not a list of numbers of robots, like 1024,4096,16384")
     if args.num_envs is not None:
-        raise ConfigError("--num-envs: --robots names all numbers of robots; leave it out")
+        raise ConfigError("--num-envs: leave it out, because --robots gives the numbers of robots")
     cfg, device = _settle(args)
     loop = args.runner or cfg.train.runner.loop
     given = without(args.words, "--robots", "--out", "--num-envs", "--runner")
@@ -220,8 +220,8 @@ def scale(args: argparse.Namespace) -> int:
 
 
 def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's results for `size` robots with these arguments; `failed` has the reason if they are missing.
-    ConfigError: the configuration does not allow so many robots.
+    """Return the benchmark's results for `size` robots with these arguments, or the reason as `failed` if it has none.
+    Raises ConfigError if the configuration does not allow this number of robots.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
@@ -248,12 +248,12 @@ def ground(args: argparse.Namespace) -> int:
     """Measure speed on different ground: `legged benchmark ground anymal_c`.
 
     The task is timed on a plane, on its terrain with this package's collider, and on its terrain with mujoco-warp's general
-    one.
+    collider.
     """
     cfg, device = _settle(args)
     where = cfg.origins.where("sim.physics")
     if resolve_physics(cfg.sim.physics, device, where, cfg.env.num_envs) != "mujoco_warp":
-        raise ConfigError(f"{where}: colliders of mujoco_warp are compared; add sim.physics=mujoco_warp")
+        raise ConfigError(f"{where}: this command compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
     if not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"TASK: '{cfg.task}' has no terrain")
     settle_on(device)
@@ -274,8 +274,8 @@ def ground(args: argparse.Namespace) -> int:
 def startup(args: argparse.Namespace) -> int:
     """Time a training until it begins: `legged benchmark startup anymal_c_flat`.
 
-    A training is started in a process of its own and ended after its first iteration. The seconds at which each stage of the
-    start ended are printed, next to those that `import torch` alone takes.
+    A training is started in a separate process and ended after its first iteration. The command prints the time at which each
+    stage of the start ended, and the time of `import torch` alone [s].
     """
     _settle(args)
     times = _time_start(args.words, args.repeats)
@@ -291,9 +291,9 @@ def startup(args: argparse.Namespace) -> int:
 
 
 def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
-    """Return medians of `repeats` runs, after one run that fills caches: `torch_s`, the time of `import torch`; `stages`, the
-    end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`; the `ratio` of
-    the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
+    """Return medians over `repeats` runs, which follow a run that fills caches: `torch_s`, the time of `import torch`;
+    `stages`, the end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`;
+    the `ratio` of the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
     """
     training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
     runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]
@@ -313,7 +313,7 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
 def _run(*arguments: str) -> dict[str, float]:
     """Run Python in an empty folder; return the end of each stage of a start, and of the process as `end` [s]."""
     with tempfile.TemporaryDirectory() as folder, tempfile.NamedTemporaryFile("r", encoding="utf-8") as file:
-        # Where this package is not installed, the process finds it as this one did, and so user-defined modules.
+        # The process must find this package, if it is not installed, and user-defined modules where this process did.
         path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
         environment = os.environ | {"PYTHONPATH": path, STAGES_FILE: file.name}
         start = time.time()
@@ -350,7 +350,7 @@ class Driver:
         self._made += 1
 
     def keep(self) -> None:
-        """Store the physics' state if a policy acts: the policy must not meet motion that it did not command."""
+        """Store the physics' state if a policy acts, because the policy must not observe motion that it did not command."""
         if self._act is not None:
             self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
 
@@ -365,10 +365,10 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
     """Return milliseconds per control step: of the task's step, and of its physics alone, under random actions or those of a
     policy `act`, observations -> actions.
 
-    Physics alone is `decimation` engine steps of the same model under the present torques. On a GPU it is one graph too. If
-    the task's step consists of mujoco-warp's parts, as many of mujoco-warp's own steps are timed as well. All are timed in
-    turns, step by step, so that they meet the states, contacts and clock rates of a rollout: without a controller or resets,
-    the physics would soon simulate heaps of fallen robots.
+    Physics alone is `decimation` engine steps of the same model under the present torques. On a GPU they are one graph too.
+    If the task's step consists of mujoco-warp's parts, as many of mujoco-warp's own steps are timed as well. All are timed in
+    turns, step by step, so that states, contacts and clock rates are those of a rollout. Without a controller or resets, the
+    physics would soon simulate fallen robots only.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)
@@ -397,7 +397,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
 
 
 def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that makes the engine steps of one control step; it is a CUDA graph if the task's step is one."""
+    """Return a function that runs the engine steps of one control step, as a CUDA graph if the task's step is one."""
 
     def run() -> None:
         for _ in range(task.cfg.control.decimation):
@@ -448,8 +448,8 @@ def synchronize(device: torch.device) -> None:
 
 
 def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
-    """Return the runners to time, by name of the loop: the loop `asked`, or else all. Students of a `teacher` and policies
-    with an estimator have only the loop of the configuration.
+    """Return the runners to time, by name of the loop: the loop `asked`, or all loops if it is None. Students of a `teacher`
+    and policies with an estimator have only the loop of the configuration.
     """
     own = cfg.train.runner.loop
     if teacher is not None:
@@ -459,8 +459,8 @@ def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dic
 
 
 def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
-    """Return the medians of rollout, update and iteration times [ms] and the range of the latter, over `count` iterations of
-    a training with new networks, after a first iteration that is left out.
+    """Return the medians of rollout, update and iteration times, and the range of iteration times [ms]. They are measured
+    over `count` iterations of a training with new networks, after a first iteration that does not count.
     """
     shown: list[Progress] = []
     display = SimpleNamespace(show=shown.append)
@@ -482,8 +482,8 @@ def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> 
 
 
 def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
-    """Return the kernels of a control step as the graph replays them, slowest first; means over `steps` steps with small
-    random actions. `launches` is the number of launches in a control step, which varies with the iterations of solvers, and
+    """Return the kernels of a control step, slowest first. The numbers are means over `steps` steps with small random
+    actions. `launches` is the number of launches in a control step, which varies with the iterations of solvers, and
     `total_us` their GPU time [us].
     """
     actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))

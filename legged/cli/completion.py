@@ -71,14 +71,14 @@ def completion(args: argparse.Namespace) -> int:
 
 
 def whole_parser() -> argparse.ArgumentParser:
-    """Return a parser of all commands, whose arguments know how they are completed."""
+    """Return a parser of all commands. Its arguments name the shell functions that complete them."""
     whole = argparse.ArgumentParser("legged")
     commands = whole.add_subparsers()
     groups: dict[str, argparse._SubParsersAction] = {}
     for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = load(name).build_parser()
-        for action in parser._actions if name != "migrate" else ():  # tasks of `migrate` are names of legged_gym
+        for action in parser._actions if name != "migrate" else ():  # `migrate` takes the names of legged_gym's tasks
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
@@ -93,8 +93,8 @@ def whole_parser() -> argparse.ArgumentParser:
 
 
 def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
-    """Return `key=` for all fields that tasks of these classes have, with the entries of maps by term, terrain type or
-    property of the model.
+    """Return `key=` for all settings of tasks of these classes. Maps by term, terrain type or property of the model have
+    one key for each entry.
     """
     found: set[str] = set()
     for kind in kinds:

@@ -39,13 +39,13 @@ LISTENING = "listening at "
 REPORT, POSES = "report.json", "poses.npy"
 """Files in the folder of a run."""
 PRIORITY = 10
-"""Priority below the program's."""
+"""Real-time priority (1 to 99). The program's priority is higher."""
 BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 ROOM_MB = 16.0
 """Disk space for the exported policy and the log [MiB]."""
 END_S = 20.0
-"""Longest time for a process to end after it was told to [s]."""
+"""Longest time that a process may take to end [s]."""
 DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
 """Exit codes of a program that did not move the robot."""
 FILM = "film.mp4"
@@ -78,11 +78,11 @@ SIMULATION = (
     arguments=(
         argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
         *SIMULATION,
-        argument("--contract", type=Path, help="policy.json whose motors and map the robot has; ideal motors without one"),
+        argument("--contract", type=Path, help="policy.json that defines motors and height map; ideal motors without it"),
         argument(
             "--out",
             type=Path,
-            help=f"folder for {REPORT} and {POSES}, 25 poses a second of the first half minute",
+            help=f"folder for {REPORT} and {POSES}, the poses of the first 30 s at 25 Hz",
         ),
         argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600"),
     ),
@@ -105,7 +105,7 @@ def robot(args: argparse.Namespace) -> int:
     contract = None if args.contract is None else read_contract(args.contract)
     (rotored, motors), scan = motors_of(args, loaded, contract), scan_of(contract)
     server = Server(SimulatedRobot(rotored, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
-    take_priority(PRIORITY)  # motors and sensors of a real robot do not wait for other processes either
+    take_priority(PRIORITY)  # a real robot's motors and sensors do not wait for other processes
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
     if args.out is not None:
@@ -208,8 +208,8 @@ def sim(args: argparse.Namespace) -> int:
 
 
 def _exported(name: str) -> Path:
-    """Return the folder of the exported policy `name`. A run whose newest checkpoint was not exported is exported first, and
-    so is a shipped policy.
+    """Return the folder of the exported policy `name`. A shipped policy, or a run whose newest checkpoint was not exported,
+    is exported first.
     """
     given = Path(name).parent if name.endswith(".onnx") else Path(name)
     if exists(given / "policy.onnx"):
@@ -221,7 +221,9 @@ def _exported(name: str) -> Path:
             return given / EXPORTED
     policy = policy_of(name)
     if not isinstance(policy.cfg, LeggedConfig):
-        raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; the program is for legged robots that do")
+        raise ConfigError(
+            f"POLICY: '{policy.cfg.task}' follows no commands; the program needs a policy of a legged robot that does"
+        )
     folder = policy.output("deploy") / EXPORTED
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
@@ -231,8 +233,8 @@ def _exported(name: str) -> Path:
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
-    """Return the simulated robot: the one `given`, else the policy's. A contract names a user-defined robot without its
-    folder, which is in the configuration of the run that contains the export.
+    """Return the simulated robot: the one `given`, else the policy's. A contract names a robot without its folder. The folder
+    of a user-defined robot is in the configuration of the run that contains the export.
     """
     if given is not None:
         return load_robot(given, "--robot")
@@ -264,7 +266,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         text=True,
-        start_new_session=True,  # Ctrl-C is for the program, which stops the robot safely first
+        start_new_session=True,  # Ctrl-C must reach only the program, which stops the robot safely
     )
     program = None
     if in_main_thread():  # a signal to this process ends the other two as well
@@ -283,7 +285,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         try:
             simulator.communicate(timeout=END_S)
         except subprocess.TimeoutExpired as error:
-            raise RunError("the simulated robot did not hear the program's goodbye") from error
+            raise RunError("the simulated robot did not end after the program") from error
         if simulator.returncode:
             raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
     finally:
@@ -313,7 +315,7 @@ def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
-    """Write a film of the poses in `folder` with the states of its log.npz; fewer than two poses make no film.
+    """Write a film of the poses in `folder` with the states of its log.npz; no film if there are fewer than two.
 
     Raises:
         RunError: this machine cannot render, or the film cannot be written.
@@ -321,7 +323,7 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
     poses = np.load(folder / POSES)
     log = np.load(folder / "log.npz")
     if len(poses) < 2 or "times" not in log:
-        (folder / FILM).unlink(missing_ok=True)  # left by another run
+        (folder / FILM).unlink(missing_ok=True)  # another run may have left it
         print(f"{folder}: no film, because the run was too short")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)

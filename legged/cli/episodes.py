@@ -51,12 +51,12 @@ RECORDING = (
     argument("--episodes", type=int, default=EPISODES, help=f"number of episodes; {EPISODES} by default"),
     argument("--as-trained", action="store_true", help="with noise, pushes, randomisation and curricula"),
     argument("--command", metavar="VX,VY,YAW", help="the command, held throughout [m/s, m/s, rad/s]"),
-    argument("--terrain", metavar="TYPE", help="type of a few tiles, e.g. stairs_up, in place of the training's"),
-    argument("--difficulty", type=float, help="difficulty of such tiles, 0 to 1; 0.5 and 0.8 by default"),
+    argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up, not on the training's"),
+    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; 0.5 and 0.8 by default"),
 )
 """Options of the recording."""
 LISTING = (
-    argument("--sort", default=FELL, help=f"{', '.join((FELL, *COLUMNS))}; the worst first"),
+    argument("--sort", default=FELL, help=f"order of the list, the worst first: {', '.join((FELL, *COLUMNS))}"),
     argument("--ended", metavar="TERM", help="only episodes that this termination ended"),
     argument("--top", type=int, default=TOP, help=f"episodes to list; {TOP} by default"),
     argument("--page", metavar="IDS", help="episodes to make pages of, by number: 3 or 3,17"),
@@ -76,7 +76,7 @@ def _wish_of(args: argparse.Namespace) -> Wish:
     check_number("--num-envs", args.num_envs, 1, MOST_EPISODES)
     robots = args.num_envs if args.num_envs is not None else min(args.episodes, MOST_ROBOTS)
     if robots > args.episodes:
-        raise ConfigError(f"--num-envs: {robots} robots have no more than {args.episodes} episodes to run (--episodes)")
+        raise ConfigError(f"--num-envs: {robots} robots are too many for {args.episodes} episodes (--episodes)")
     command = velocity_command(args.command) if args.command is not None else None
     changes = tuple(policy_overrides(args))
     return Wish(args.episodes, robots, args.as_trained, command, args.terrain, args.difficulty, changes)
@@ -91,7 +91,7 @@ def _check_listing(args: argparse.Namespace) -> None:
     check_number("--top", args.top, 0)
     check_number("--worst", args.worst, 0)
     if args.sort not in (FELL, *COLUMNS):
-        raise ConfigError(f"--sort: there is no order '{args.sort}'{suggest(args.sort, (FELL, *COLUMNS))}")
+        raise ConfigError(f"--sort: cannot sort by '{args.sort}'{suggest(args.sort, (FELL, *COLUMNS))}")
     _pages(args.page, None)
     if args.parquet and find_spec("pyarrow") is None:
         raise ConfigError("--parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'")
@@ -109,7 +109,7 @@ def _pages(text: str | None, count: int | None) -> list[int]:
             raise ConfigError(f"--page: expected numbers of episodes like 3 or 3,17, got '{text}'")
         numbers.append(int(part))
         if count is not None and numbers[-1] >= count:
-            raise ConfigError(f"--page: there is no episode {numbers[-1]}; they are 0 to {count - 1}")
+            raise ConfigError(f"--page: there is no episode {numbers[-1]}; episodes are numbered 0 to {count - 1}")
     return numbers
 
 
@@ -119,7 +119,7 @@ def _run_episodes(policy: TrainedPolicy, wish: Wish, args: argparse.Namespace) -
 
 
 def _show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
-    """Print the list of episodes; write all of it as Markdown into `folder`, with the chosen pages and table."""
+    """Print the top of the list of episodes; write the whole list as Markdown into `folder`, with chosen pages and table."""
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = _pages(args.page, len(episodes)) + order[: args.worst]
@@ -153,8 +153,8 @@ def record(args: argparse.Namespace) -> int:
     """Record episodes and list the worst: `legged episodes record anymal_c_flat --worst 1`.
 
     Robots run whole episodes under a policy. episodes.npz and .json hold every state, command, action, torque, contact and
-    reward term; the episodes that went worst are listed. With --page or --worst each of those gets a page with a film next to
-    plots, all with one cursor.
+    reward term; the worst episodes are listed. With --page or --worst, chosen episodes get pages with a film next to plots
+    that share a cursor.
     """
     _check_listing(args)
     register_given(args, "policy")
@@ -184,7 +184,7 @@ def record(args: argparse.Namespace) -> int:
         argument("folder", type=Path, metavar="FOLDER", help="folder of recorded episodes"),
         IMPORT,
         *LISTING,
-        argument("--out", type=Path, help="folder for all files; that of the episodes by default"),
+        argument("--out", type=Path, help="folder for all files; by default the folder of the episodes"),
     ),
 )
 def list_(args: argparse.Namespace) -> int:
@@ -204,7 +204,7 @@ def list_(args: argparse.Namespace) -> int:
 
 def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
     """Return arguments that name policies or recordings, the options of a recording, and --out, `folder` by default."""
-    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "the other one")
+    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "policy or recording to compare with")
     return (
         *(argument(name, metavar="POLICY", help=says) for name, says in zip(names, helps, strict=False)),
         *BUILD,
@@ -221,7 +221,7 @@ def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
 def statistics(args: argparse.Namespace) -> int:
     """Measure mean and standard deviation of every joint: `legged episodes statistics anymal_c_flat --episodes 50`.
 
-    The numbers are those of episodes that are run for this purpose, or of recorded ones if a folder is named.
+    The episodes are run for this purpose, unless a folder of recorded episodes is named.
     """
     return _report(args, args.policy)
 
@@ -243,13 +243,13 @@ def _report(args: argparse.Namespace, *names: str) -> int:
     """Print the joint statistics of policies or recordings, write them into the folder --out, and return 0.
 
     Raises:
-        ConfigError: there is no such policy, an option does not fit it, or two policies have other joints.
+        ConfigError: there is no such policy, an option does not fit it, or two policies have different joints.
     """
     import_given(args)
     wish = _wish_of(args)
     ready_to_write(args.out)
     sources = []
-    for name in names:  # all are checked before anything is built
+    for name in names:  # check all of them before anything is built
         recorded = exists(Path(name) / ABOUT)
         sources.append(load_episodes(Path(name), "POLICY") if recorded else policy_of(name))
         if not isinstance(sources[-1], Episodes):

@@ -43,7 +43,7 @@ ROBOTS = 16
 MOST_SIZES = 16
 """Largest number of sizes of a terrain type that are measured at the same time."""
 ENVIRONMENTS = 256
-"""Default number of episodes, each in an environment of its own."""
+"""Default number of episodes; each runs in a separate environment."""
 IN_GYMNASIUM = 20
 """Default number of episodes in Gymnasium's environment."""
 EVALUATED = (
@@ -51,8 +51,8 @@ EVALUATED = (
     argument(
         "--out",
         type=Path,
-        help="folder for JSON and PNG files; by default the checkpoint's, logs/evaluate for a shipped policy, and changed/ in"
-        " it if fields are overridden",
+        help="folder for JSON and PNG files; by default the checkpoint's folder, or logs/evaluate for a shipped policy;"
+        " its subfolder changed/ if settings are overridden",
     ),
 )
 """Arguments that all evaluations of a checkpoint have."""
@@ -75,7 +75,7 @@ def _points(full: str) -> tuple[Argument, Argument]:
 
 
 def check_points(given: int | None, full: bool) -> int:
-    """Return the number of robots for each size of a terrain type: `given` by --robots-per-point, or the default.
+    """Return the number of robots for each size of a terrain type: the value `given` with --robots-per-point, or the default.
 
     Raises:
         ConfigError: the number is below 1, or larger than any machine can hold.
@@ -85,14 +85,14 @@ def check_points(given: int | None, full: bool) -> int:
 
 
 def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
-    """Return the setting of a command line. If the evaluation `follows` commands, the policy must do so too.
+    """Return the setting that a command line describes. If `follows`, the policy must follow velocity commands.
 
     Raises:
         ConfigError: there is no such policy or device, or the folder cannot be written.
     """
     register_given(args, "policy")
     if args.num_envs is not None:
-        raise ConfigError("--num-envs: the evaluation chooses the number of robots; leave it out")
+        raise ConfigError("--num-envs: leave it out, because the evaluation chooses the number of robots")
     device, policy = measuring_device(args), policy_of(args.policy, args.checkpoint)
     task = policy.cfg.task
     if follows and not isinstance(policy.cfg, LeggedConfig):
@@ -144,11 +144,11 @@ def evaluate(args: argparse.Namespace) -> int:
 def _check_plain(args: argparse.Namespace) -> None:
     """Check that no option is given that has no effect on an ONNX file, which runs in C MuJoCo unchanged."""
     if args.overrides:
-        raise ConfigError(f"{args.overrides[0]}: an ONNX file runs as it is; `legged evaluate onnx` has its options")
+        raise ConfigError(f"{args.overrides[0]}: an ONNX file runs unchanged; see the options of `legged evaluate onnx`")
     for name, value in vars(evaluate.build_parser().parse_args([args.policy])).items():
         if getattr(args, name) != value and name not in ("out", "overrides"):
             option = f"--{'import' if name == 'module' else name.replace('_', '-')}"
-            raise ConfigError(f"{option}: means nothing for an ONNX file; `legged evaluate onnx` has its options")
+            raise ConfigError(f"{option}: has no effect on an ONNX file; see the options of `legged evaluate onnx`")
 
 
 @sub_command(
@@ -167,7 +167,7 @@ def grid(args: argparse.Namespace) -> int:
     if everywhere:
         args.physics = None
         if args.solver is not None:
-            raise ConfigError(f"--solver: --physics {EVERYWHERE} measures in all of them; leave one of the two out")
+            raise ConfigError(f"--solver: --physics {EVERYWHERE} measures with all solvers; leave one of the two options out")
     setting = _settle(args)
     cells = _grid_of(setting, args)
     return cross(setting, cells) if everywhere else evaluate_following(setting, cells)
@@ -190,7 +190,7 @@ def terrain(args: argparse.Namespace) -> int:
     sizes = chosen_sizes(cfg, args.types, args.full, setting.cfg.terrain.scale)  # type: ignore[arg-type]
     if not sizes:
         raise ConfigError(
-            f"POLICY: '{cfg.task}' was trained on a plane; --types names the terrain types that it should cross"
+            f"POLICY: '{cfg.task}' was trained on a plane; name the terrain types that it should cross with --types"
         )
     return evaluate_following(setting, None, sizes, robots)
 
@@ -237,9 +237,7 @@ def stress(args: argparse.Namespace) -> int:
             default=WALKING_RMSE,
             help=f"largest velocity RMSE of a robot that walks [m/s]; {WALKING_RMSE} by default",
         ),
-        argument(
-            "--falls", type=float, default=WALKING_FALLS, help=f"and largest share of falls; {WALKING_FALLS} by default"
-        ),
+        argument("--falls", type=float, default=WALKING_FALLS, help=f"largest share of falls; {WALKING_FALLS} by default"),
     ),
 )
 def checkpoints(args: argparse.Namespace) -> int:
@@ -251,7 +249,7 @@ def checkpoints(args: argparse.Namespace) -> int:
     check_number("--rmse", args.rmse, 0, 100, above=True)
     check_number("--falls", args.falls, 0, 1, above=True)
     if args.checkpoint is not None:
-        raise ConfigError("--checkpoint: all checkpoints of the run are measured; leave it out")
+        raise ConfigError("--checkpoint: leave it out, because all checkpoints of the run are measured")
     setting = _settle(args)
     return evaluate_all_checkpoints(setting, _grid_of(setting, args), args.rmse, args.falls)
 
@@ -294,7 +292,7 @@ def gymnasium(args: argparse.Namespace) -> int:
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     for option in ("physics", "solver", "sim_device"):
         if getattr(args, option) is not None:
-            raise ConfigError(f"--{option.replace('_', '-')}: Gymnasium simulates by itself; leave it out")
+            raise ConfigError(f"--{option.replace('_', '-')}: leave it out, because Gymnasium simulates the robots")
     return evaluate_in_gymnasium(_settle(args, follows=False), args.episodes)
 
 
@@ -306,7 +304,7 @@ COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), 
 SECONDS, HOLD_S = 8.0, Grid.hold_s
 """Default length of a single command, and of a command of a grid [s]."""
 MOST_CELLS = 10_000
-"""Largest number of commands of a grid; one robot takes seconds for each."""
+"""Largest number of commands of a grid, because one robot takes seconds for each."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
 """Files of an exported folder: the network, and its description."""
@@ -320,17 +318,17 @@ EXPORTED = ("policy.onnx", "policy.json")
         argument("--robot", help="name or folder of the robot; that of the policy.json by default"),
         argument(
             "--layout",
-            help="what the observation is made of: a YAML file, 'holosoma', or a policy.json; the one beside the file by"
-            " default",
+            help="description of the observation: a YAML file, 'holosoma', or a policy.json; by default the policy.json"
+            " next to the file",
         ),
         argument("--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"),
         *(
-            argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another one is given")
+            argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if only other axes are given")
             for axis, unit in AXES.items()
         ),
-        argument("--seconds", type=float, help=f"length of each command; {SECONDS:g}, of a grid's {HOLD_S:g}"),
-        argument("--friction", type=float, default=0.8, help="between robot and ground; 0.8 by default"),
-        argument("--rmse", type=float, help="largest mean velocity RMSE of a grid that is followed [m/s]"),
+        argument("--seconds", type=float, help=f"length of each command [s]; default {SECONDS:g}, or {HOLD_S:g} with a grid"),
+        argument("--friction", type=float, default=0.8, help="friction between robot and ground; 0.8 by default"),
+        argument("--rmse", type=float, help="largest mean velocity RMSE of a policy that follows the grid [m/s]"),
         argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written"),
     ),
 )
@@ -348,9 +346,7 @@ def onnx(args: argparse.Namespace) -> int:
     settling = grid.settle_s if grid else SETTLING_S
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
     if not settling < seconds <= 1000.0:
-        raise ConfigError(
-            f"--seconds: must be above {settling:g}, in which the robot settles, and at most 1000, got {seconds}"
-        )
+        raise ConfigError(f"--seconds: must be above {settling:g}, the time for settling, and at most 1000, got {seconds}")
     if not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [velocity_command(text) for text in args.command or ()] or COMMANDS
@@ -360,11 +356,11 @@ def onnx(args: argparse.Namespace) -> int:
     layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
     contract = layouts[0].contract
     if args.robot is None and contract is None:
-        raise ConfigError(f"--robot: is missing; the layout '{args.layout}' names none")
+        raise ConfigError(f"--robot: is missing; name one, because the layout '{args.layout}' does not")
     robot = load_robot(args.robot or contract.robot, "--robot")  # type: ignore[union-attr]
     policies = [ForeignPolicy(path, layout, robot) for path, layout in zip(files, layouts, strict=True)]
     if contract is not None and was_trained_with_other_motors(contract):
-        told = "the policy was trained with motors that are not ideal (its actuator says which); here they are"
+        told = "the policy was trained with other motors (see `actuator` in it) than the ideal motors used here"
         print(f"warning: {contract.path}: {told}", file=sys.stderr, flush=True)
     if grid:
         result = _follow_all(robot, policies, files, args, grid)
@@ -403,7 +399,7 @@ def _description(file: Path, first: Path) -> Path:
     """Return the policy.json next to a file, or else next to the first file."""
     path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
     if path is None:
-        raise ConfigError(f"{first}: no {EXPORTED[1]} lies beside it; give the contents of its observation with --layout")
+        raise ConfigError(f"{first}: there is no {EXPORTED[1]} next to it; describe its observation with --layout")
     return path
 
 
@@ -428,8 +424,8 @@ def _grid_in(args: argparse.Namespace) -> Grid | None:
 def _follow_all(
     robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
-    """Measure every policy on the grid, print a line about each, and return all figures. Policies that state their training
-    time are sorted by it.
+    """Measure every policy on the grid, print a line about each, and return all figures. Policies that state
+    their training time are sorted by this time.
     """
     known = [(path, policy, _marks(policy)) for path, policy in zip(files, policies, strict=True)]
     heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")

@@ -28,7 +28,7 @@ MEGABYTES = 5.0
         argument(
             "--out",
             type=Path,
-            help="folder for the folders; exported/ in the run folder by default, or logs/export/ for a shipped policy",
+            help="folder for the files; by default exported/ in the run folder, or logs/export/ for a shipped policy",
         ),
     ),
 )
@@ -37,11 +37,11 @@ def export(args: argparse.Namespace) -> int:
 
     Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. Their metadata
     hold the iteration and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the
-    first of them that walks. `legged play` exports the last checkpoint alone.
+    first policy that walks. `legged play` exports the last checkpoint alone.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:
-        raise ConfigError("--checkpoint: all checkpoints of the run are exported; leave it out")
+        raise ConfigError("--checkpoint: leave it out, because all checkpoints of the run are exported")
     device = torch.device("cpu")
     settle_on(device)
     policy = policy_of(args.policy)

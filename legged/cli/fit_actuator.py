@@ -46,14 +46,14 @@ class Fit:
     arguments=(
         argument("log", metavar="LOG", type=Path, help="the log, an .npz file"),
         argument("--out", type=Path, default=Path("actuator"), help="folder that is written"),
-        argument("--joints", default="", help="parts of the names of the joints to fit; all by default"),
+        argument("--joints", default="", help="parts of the names of the joints to fit; all joints by default"),
         argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default"),
         argument("--hidden", help="units of the network's layers; 32,32,32 by default, 8,8 for an lstm"),
-        argument("--samples", type=int, default=3, help="moments that an mlp sees; 3 by default"),
+        argument("--samples", type=int, default=3, help="moments in the input of an mlp; 3 by default"),
         argument("--spacing", type=float, default=0.01, help="time between the moments of an mlp [s]; 0.01 by default"),
         argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default"),
         argument("--updates", type=int, help="updates of the network; 2000 by default, 3000 for an lstm"),
-        argument("--longest-delay", type=float, default=0.05, help="delays up to this are tried [s]; 0.05 by default"),
+        argument("--longest-delay", type=float, default=0.05, help="longest delay that is tried [s]; 0.05 by default"),
         argument("--seed", type=int, default=1, help="seed of the network's first weights"),
     ),
 )
@@ -64,8 +64,8 @@ def fit_actuator(args: argparse.Namespace) -> int:
     time (T,). The arrays run (T,), stiffness, damping and torque_limit may be added if they are known. Sample at 200 Hz or
     more: motion between two samples can't be learned.
 
-    Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are judged
-    on a fifth of the log that the fit has not seen. The folder gets actuator.yaml (a section control.actuator with the
+    Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are tested
+    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (a section control.actuator with the
     parts), network.npz (for control.actuator.network), fit.json and fit.png.
     """
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
@@ -90,7 +90,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
     _tell(log)
     drive = fit_drive(log, args.longest_delay)
     _tell_drive(drive, log)
-    from legged.fitting.training import predict, train_network  # torch imports slowly; a wrong log fails before
+    from legged.fitting.training import predict, train_network  # slow to import: wrong logs fail before
 
     weights = train_network(at_steps, args.kind, hidden, args.samples, spacing, updates, args.seed)
     fits = [Fit("parametric", log, drive.predict(log)), Fit("network", at_steps, predict(weights, at_steps))]
@@ -149,8 +149,8 @@ def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
 
 
 def errors(fit: Fit) -> dict[str, float]:
-    """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of their
-    variance.
+    """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of the
+    variance of the measured torques.
     """
     measured = fit.log.torque[fit.log.held_out]
     wrong = fit.torque[fit.log.held_out] - measured
@@ -159,8 +159,8 @@ def errors(fit: Fit) -> dict[str, float]:
 
 
 def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
-    """Return the section `control` of a fitted drive, for the joints of a log with the time step of the physics. Gains that
-    the log does not state are part of it.
+    """Return the section `control` for a fitted drive and the joints of a log with the physics' time step. It includes the
+    gains if they were fitted, that is, if the log does not state them.
     """
 
     def named(**values: float) -> dict[str, dict[str, float]]:
@@ -213,7 +213,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
 
 
 def _shown(log: ActuatorLog) -> np.ndarray:
-    """Return the indices of the first held-out samples of a log, all of one run."""
+    """Return the indices of the held-out samples of one run within `SHOWN_S` of the first one."""
     held = log.held_out
     start = int(np.flatnonzero(held)[0])
     rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))

@@ -20,7 +20,7 @@ from legged.process.paths import data_folder
 def list_(args: argparse.Namespace) -> int:
     """List tasks and robots of this installation: `legged list`.
 
-    The lists are read from the files' comments, which is fast.
+    The descriptions are the comments in the files, so that nothing is built.
     """
     if args.what != "robots":
         print_rows("tasks, each for `legged train TASK`", tasks())

@@ -1,6 +1,6 @@
 """The `legged` command: finds the sub-command that was typed and runs it.
 
-Nothing heavy is imported here: `legged --help` answers before torch would be loaded.
+This module imports nothing large, so that `legged --help` answers without loading torch.
 """
 
 import difflib
@@ -61,11 +61,11 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "completion": ("legged.cli.completion:completion", "print a completion script for a shell"),
     "list": ("legged.cli.list:list_", "list tasks and robots"),
 }
-"""Words of a command -> its module and its name there, and a summary."""
+"""Words of a command -> its module with the name of its function, and a summary."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command whose words begin `argv`, that of this process by default; return its exit code."""
+    """Run the command that the first words of `argv` name, by default those of this process; return its exit code."""
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:
@@ -94,7 +94,7 @@ def split(words: list[str]) -> tuple[str | None, list[str]]:
 
 @contextmanager
 def hint_at_sub_command(group: str, words: Sequence[str]) -> Iterator[None]:
-    """Add the nearest sub-command of `group` to an error about one of `words`, which may be a sub-command misspelt.
+    """Add the nearest sub-command of `group` to an error about one of `words`, because the word may be a misspelt one.
 
     Raises:
         ConfigError: the error, with the hint.
@@ -123,7 +123,7 @@ def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
 
 
 def _print_help(words: list[str]) -> int:
-    """Print the commands, or those of a group; return the exit code 0. ConfigError names a word that is neither."""
+    """Print all commands, or those of a group; return the exit code 0. Raises ConfigError for an unknown word."""
     groups: dict[str, dict[str, str]] = {}
     for name, (_, summary) in COMMANDS.items():
         groups.setdefault(name.partition(" ")[0], {})[name] = summary

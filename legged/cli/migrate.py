@@ -21,7 +21,7 @@ from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot
 
 FIRST = ("rewards", "observations", "robot")
-"""Subjects of the first lines of the report."""
+"""Subjects with which the report begins."""
 
 
 @sub_command(
@@ -30,19 +30,19 @@ FIRST = ("rewards", "observations", "robot")
     arguments=(
         argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes"),
         argument("--run", action="store_true", help="run the file and the modules that it imports"),
-        argument("--task", help="class or registered task to migrate, or a name for the only one"),
-        argument("--robot", help="robot under resources/robots/, or a folder; by the asset's name, if there is one"),
+        argument("--task", help="class or registered task to migrate; if there is only one, a new name for it"),
+        argument("--robot", help="robot under resources/robots/, or a folder; by default the robot with the asset's name"),
         argument("--out", type=Path, default=Path("."), help="folder for the files that are written"),
-        argument("--force", action="store_true", help="write over files of the same names"),
+        argument("--force", action="store_true", help="write over existing files"),
     ),
 )
 def migrate(args: argparse.Namespace) -> int:
     """Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
 
-    The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and the
-    like need not be installed. From the live classes it writes <task>.yaml with the settings that differ from the defaults,
-    and robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are the fork's
-    own, and lists every setting without a counterpart, with file and line.
+    The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and
+    similar libraries need not be installed. From the live classes it writes <task>.yaml with the settings that differ from
+    the defaults, and robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are
+    the fork's own, and lists every setting without a counterpart, with file and line.
     """
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
@@ -50,7 +50,7 @@ def migrate(args: argparse.Namespace) -> int:
         raise ConfigError(f"file: expected a Python file with configuration classes, got {shown(str(args.file))}")
     if not args.run:
         raise ConfigError(
-            f"--run: legged migrate runs {relative(args.file)} and the modules that it imports; say --run for that"
+            f"--run: legged migrate runs {relative(args.file)} and the modules that it imports; allow this with --run"
         )
     fork = read_fork(args.file, args.task)
     task = _task_name(fork.task)
@@ -61,7 +61,7 @@ def migrate(args: argparse.Namespace) -> int:
     with_folder = robot is not None and bool(entries)
     for file in (path, *([folder / "robot.yaml"] if with_folder else [])):
         if exists(file) and not args.force:
-            raise ConfigError(f"--out: {relative(file)} is there already; --force writes over it")
+            raise ConfigError(f"--out: {relative(file)} exists already; --force writes over it")
     ready_to_write(args.out)
     make_folder(args.out)
     result.settings["robot"] = _robot_setting(robot, with_folder, task, result)
@@ -114,7 +114,7 @@ def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Pat
 
 
 def _asset(file: Path, result: Translation) -> str:
-    """Return the path of the robot's file if it exists above the configuration; else as the configuration states it."""
+    """Return the path of the robot's file if it exists in a folder above the configuration, else the configuration's path."""
     asset = asset_of(result)
     found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
     return next(found, asset or "FILE.urdf")

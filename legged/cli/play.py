@@ -51,7 +51,7 @@ SHOWN_ON_A_PLANE = 4
     arguments=(
         *of_legged_gym("policy"),
         *TILES,
-        argument("--headless", action="store_true", help="record even where there is a display"),
+        argument("--headless", action="store_true", help="open no window, even if there is a display"),
         argument("--gif", action="store_true", help="also write a GIF"),
         argument("--no-video", action="store_true", help="export and measure only"),
         argument("--out", type=Path, help="folder for video and exported/; the run folder by default"),
@@ -60,10 +60,10 @@ SHOWN_ON_A_PLANE = 4
 def play(args: argparse.Namespace) -> int:
     """Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
 
-    On a display a window opens first, in which the robot follows the arrow keys.
+    If there is a display, a window opens first, in which the robot follows the arrow keys.
     """
     if args.gif and args.no_video:
-        raise ConfigError("--gif: asks for a film, and --no-video for none; leave out one of them")
+        raise ConfigError("--gif: makes a film, and --no-video makes none; leave out one of them")
     settle_name(args, "policy")
     register_given(args, "policy")
     device = pick_device(args.sim_device)
@@ -76,7 +76,7 @@ def play(args: argparse.Namespace) -> int:
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
-                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose; its ground is that of its model")
+                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose, because the model has the ground")
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
@@ -112,7 +112,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _named(args: argparse.Namespace) -> str:
-    """Return the policy's name as POLICY; legged_gym's options choose a run of the task."""
+    """Return the name of the policy: POLICY, or the run of this task that legged_gym's options choose."""
     if args.load_run is None and args.experiment_name is None:
         return str(args.policy)
     flags = [("train.runner.experiment_name", args.experiment_name)] if args.experiment_name else []

@@ -31,16 +31,16 @@ ROOM_MB = 100.0
     "legged robot add menagerie:unitree_go2 --name my_go2",
     arguments=(
         argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
-        argument("--name", help="name of the robot; that of the file by default"),
-        argument("--out", type=Path, help="folder for the robot's folder and its task; this clone's own by default"),
-        argument("--extends", metavar="TASK", help="task to take rewards from; base/quadruped_flat or base/biped_flat"),
+        argument("--name", help="name of the robot; by default the name of the file"),
+        argument("--out", type=Path, help="folder for the robot's folder and its task; by default the folders of this clone"),
+        argument("--extends", metavar="TASK", help="task to extend; by default base/quadruped_flat or base/biped_flat"),
         argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated"),
         argument(
             "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
         ),
-        argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; the file's, or a rule's, by default"),
+        argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; by default from the file, or from a rule"),
         argument("--damping", type=float, help="D gain of all joints [N m s/rad]"),
-        argument("--force", action="store_true", help="write over a robot of that name"),
+        argument("--force", action="store_true", help="write over a robot with this name"),
     ),
 )
 def add(args: argparse.Namespace) -> int:
@@ -58,7 +58,7 @@ def add(args: argparse.Namespace) -> int:
     _check_apart(path, folder)
     if not args.force and (exists(folder) or exists(task)):
         taken = folder if exists(folder) else task
-        raise ConfigError(f"--name: there is {relative(taken)} already; another name, or --force to write over it")
+        raise ConfigError(f"--name: {relative(taken)} exists already; give another name, or --force to write over it")
     if args.extends is not None:
         _check_task(args.extends, task)
     ready_to_write(folder, ROOM_MB)
@@ -99,21 +99,21 @@ def _source(given: str) -> tuple[Path, str, str]:
         return path, f"MuJoCo Menagerie, {given.removeprefix(PREFIX)}/{path.name}", licence
     path = Path(given)
     if not exists(path) or not path.is_file():
-        raise ConfigError(f"{shown(given)}: there is no such file; a URDF, an MJCF file, or {PREFIX}NAME is wanted")
+        raise ConfigError(f"{shown(given)}: there is no such file; give a URDF, an MJCF file, or {PREFIX}NAME")
     beside = [other.name for folder in (path.parent, path.parent.parent) for other in sorted(folder.glob("LICENSE*"))]
     return path.absolute(), path.name, f"see {beside[0]} beside the source" if beside else "that of the source; look it up"
 
 
 def _check_apart(source: Path, folder: Path) -> None:
-    """Check that no file that is read lies in the folder that is written, where it could be overwritten."""
+    """Check that a source file is not in the folder that is written, where it could be overwritten."""
     if source.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(
-            f"{relative(source)}: lies in {relative(folder)}, the folder that the robot goes to; another --name or --out"
+            f"{relative(source)}: is in {relative(folder)}, which would be written over; give another --name or --out"
         )
 
 
 def _check_task(name: str, beside: Path) -> None:
-    """Check that the task exists that the new one, in the file `beside` it, extends."""
+    """Check that the task `name` exists, which the new task extends. `beside` is the file of the new task."""
     folders = (data_folder("cfg"), beside.parent)
     if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
         names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
@@ -121,8 +121,8 @@ def _check_task(name: str, beside: Path) -> None:
 
 
 def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
-    """Return the robot's folder and its task's file. The name of a task that extends a `..._flat` or a `..._real` gets the
-    same ending, as in cfg/; a task on rough ground has the robot's name. Without `extends` the task is flat.
+    """Return the robot's folder and the task's file. If the extended task is called `..._flat` or `..._real`, the new name
+    has the same ending, else it is the robot's name, as in cfg/. Without `extends` the ending is `_flat`.
     """
     like = "_flat" if extends is None else extends.removesuffix(".yaml")
     file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
@@ -159,7 +159,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
 def show(args: argparse.Namespace) -> int:
     """Print joints, limits, gains and feet of a robot: `legged robot show go2`.
 
-    The numbers are those of the robot's folder, as every task with this robot begins with them.
+    The numbers come from the robot's folder. Tasks with this robot use them unless their settings change them.
     """
     robot = load_robot(args.robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")

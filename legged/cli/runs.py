@@ -40,12 +40,12 @@ from legged.process.startup import command_of_ours
 SIDE = 320
 """Width and height of the film [pixels]."""
 LONGEST_FILM_S = 900.0
-"""Time limit for filming, after which the process is ended because it hangs [s]."""
+"""Time limit for filming [s]. A process that takes longer hangs, and is ended."""
 LONGEST_NOTE = 1000
 MOST_COMPARED = 8
-"""Largest number of runs that are compared, which is the number of colours."""
+"""Largest number of runs that are compared, because there are this many colours."""
 PICTURE = "learning_curve.png"
-RUNS = (argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or tasks, whose newest runs count"), IMPORT)
+RUNS = (argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or tasks (for their newest runs)"), IMPORT)
 """The positional argument RUN, of one or more runs, and --import."""
 
 
@@ -110,7 +110,7 @@ def report(args: argparse.Namespace) -> int:
     the run.
     """
     if args.checkpoint is not None and not args.film:
-        raise ConfigError(f"--checkpoint: {args.checkpoint}: says which policy is filmed; add --film")
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: chooses the policy to film; add --film")
     folders = _folders_of(args)
     note = " ".join((args.note or "").split())
     if args.note is not None and not 0 < len(note) <= LONGEST_NOTE:
@@ -120,7 +120,7 @@ def report(args: argparse.Namespace) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            if command_of_ours():  # a drawing library may hang where exceptions do not reach it
+            if command_of_ours():  # a drawing library may hang, and no exception would end that
                 faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
             faulthandler.cancel_dump_traceback_later()
@@ -164,7 +164,7 @@ def compare(args: argparse.Namespace) -> int:
         raise ConfigError(f"RUN: expected 2 to {MOST_COMPARED} runs, got {len(args.runs)}")
     folders = _folders_of(args)
     if len({run.resolve() for run in folders}) < len(folders):
-        raise ConfigError(f"RUN: a run comes twice: {', '.join(args.runs)}")
+        raise ConfigError(f"RUN: a run is given twice: {', '.join(args.runs)}")
     ready_to_write(args.out, 4.0)
     records = [read_record(run) for run in folders]
     make_folder(args.out)
@@ -188,7 +188,7 @@ def evaluations(args: argparse.Namespace) -> int:
     """Show evaluation files side by side: `legged runs evaluations logs/anymal_c/RUN logs/anymal_c/RUN`.
 
     Evaluations of one task in one engine count as its seeds: the tables give their mean and the largest deviation from it,
-    the picture their mean and range. Evaluations with other fields changed, or on another grid of commands, are kept apart.
+    the picture their mean and range. Evaluations with different changed settings, or on different grids, get separate rows.
     """
     if args.out:
         ready_to_write(args.out)
@@ -200,7 +200,7 @@ def evaluations(args: argparse.Namespace) -> int:
     for key, seeds in grouped(results).items():
         of_episodes = {"episodes" in result for result in seeds}
         if len(of_episodes) > 1:
-            told = "some evaluations are of commands, others of episodes; compare them apart"
+            told = "some evaluations measure commands, others episodes; compare them separately"
             raise ConfigError(f"{key[0]} in {key[1]}: {told}")
         (episodes if of_episodes.pop() else following)[key] = seeds
     tracked = {key: seeds for key, seeds in following.items() if any(map(has_tracking, seeds))}
@@ -211,7 +211,7 @@ def evaluations(args: argparse.Namespace) -> int:
             console.print(table(groups))
     if args.out:
         if not with_success:
-            raise ConfigError("--out: draws success against difficulty, and none of the evaluations holds that")
+            raise ConfigError("--out: draws success against difficulty, which none of the evaluations measured")
         make_folder(args.out)
         draw_comparison(with_success, args.out / "success.png")
         print(f"written: {relative(args.out / 'success.png')}")

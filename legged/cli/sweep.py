@@ -39,7 +39,7 @@ TELL_S = 1.0
 """Interval at which the trials of other processes are read [s]."""
 MOST_STARTS = 10
 """Largest number of restarts of a worker whose process ends before the sweep does."""
-PRUNED = "ended early: others were better at that step"
+PRUNED = "ended early: other trials were better at that step"
 SIGNALLED = 128
 """Exit codes from here on mean that a signal ended a training."""
 MOST_FAILURES = 3
@@ -48,7 +48,7 @@ MOST_FAILURES = 3
 
 SWEEP = (
     argument("file", metavar="FILE", help="YAML file of the sweep, or the name of one in cfg/sweeps"),
-    argument("--sim-device", help="cpu, cuda, or a list with commas, from which the jobs take theirs"),
+    argument("--sim-device", help="cpu, cuda, or several devices with commas, which the jobs share"),
     argument("--storage", help="URL of a database that several machines share, or journal:<file>"),
     IMPORT,
 )
@@ -56,7 +56,7 @@ SWEEP = (
 
 
 def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, list[torch.device]]:
-    """Return the plan of the sweep's file and the devices of --sim-device. `trials` is the value of --trials.
+    """Return the plan in the sweep's file and the devices of --sim-device. `trials` is the value of --trials.
 
     Raises:
         ConfigError: there is no such device, CPU and GPU are mixed, optuna is missing, or the file is wrong.
@@ -76,8 +76,8 @@ def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, 
     "legged sweep run cfg/sweeps/anymal_c_flat.yaml --trials 60 --jobs 4",
     arguments=(
         *SWEEP,
-        argument("--trials", type=int, help="trials in all, of all processes; those of the file by default"),
-        argument("--jobs", type=int, help="processes side by side; one for each device by default"),
+        argument("--trials", type=int, help="number of trials of all processes together; by default from the file"),
+        argument("--jobs", type=int, help="number of parallel processes; one for each device by default"),
         argument("--worker", type=int, metavar="NUMBER", help=argparse.SUPPRESS),
     ),
 )
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     them.
     """
     if Ranks.now().several:
-        raise ConfigError("sweep: starts its processes by itself; run it without torchrun")
+        raise ConfigError("sweep: run it without torchrun, because it starts its processes itself")
     check_number("--jobs", args.jobs, 1)
     check_number("--trials", args.trials, 1)
     plan, devices = _settle(args, args.trials)
@@ -100,14 +100,14 @@ def run(args: argparse.Namespace) -> int:
     alone = ["--sim-device", str(devices[0]), *flags]
     if devices[0].type == "cpu" and jobs > 1:
         alone.append(f"sim.threads={max(1, available_cores() // jobs)}")
-    if args.worker is not None:  # one of several processes
+    if args.worker is not None:  # this process is one of several
         stopped_by = Worker(plan, trials, alone).run()
         return 128 + stopped_by[0] if stopped_by else 0
     trials.keep_to(devices[0].type)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
     beyond = [f"{path} {shown(plan.own[path])}" for path, drawn in plan.own_drawn.items() if drawn is None]
     if beyond:
-        print(f"no trial has the task's own settings, of which these are not among those tried: {', '.join(beyond)}")
+        print(f"no trial has the task's settings, because the sweep excludes these values: {', '.join(beyond)}")
     again = trials.take_back()
     if trials.all:
         numbers = f"; tried again: {', '.join(map(str, again))}" if again else ""
@@ -162,18 +162,18 @@ def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -
 
 
 class Stopped(Exception):
-    """A training was ended by a signal; the argument is its number."""
+    """Exception of a training that a signal ended; the argument is the number of the signal."""
 
 
 class NoValue(Exception):
-    """A trial without a value, which counts as ended early; the text is the reason."""
+    """Exception of a trial without a value, which counts as ended early; the text is the reason."""
 
 
 class Worker:
     """Runner of trials."""
 
     def __init__(self, plan: Plan, trials: Trials, flags: Sequence[str]) -> None:
-        """Store the options of `legged train` for device and threads."""
+        """Take `flags`, the options of `legged train` for device and threads."""
         self.plan, self.trials, self._flags = plan, trials, [*flags]
         self._start = time.perf_counter()
         self._failures = 0
@@ -186,7 +186,7 @@ class Worker:
             while not self._stopped and os.getppid() == parent and (trial := self.trials.next()) is not None:
                 try:
                     self._make(trial)
-                except Stopped as signalled:  # a training handles signals itself
+                except Stopped as signalled:  # during a training, the training handles signals
                     self._stopped = True
                     in_trials.append(signalled.args[0])
         return [*stopped_by, *in_trials]
@@ -226,7 +226,7 @@ class Worker:
             self.trials.study.tell(trial, value)
             say(f"{self.plan.objective_text}: {value:.4g}")
         finally:
-            gc.collect()  # tensors and graphs of a training are in reference cycles
+            gc.collect()  # reference cycles keep tensors and graphs of a training alive
             if torch.cuda.is_available():
                 torch.cuda.empty_cache()
 
@@ -292,7 +292,7 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
     """Return the value of the objective for a training.
 
     Raises:
-        NoValue: it did not reach its target, or no figure is finite.
+        NoValue: the training did not reach the target, or no figure is finite.
     """
     objective, figure = plan.given.objective, plan.figure
     values = [found.figures[figure] for found in history if math.isfinite(found.figures[figure])]

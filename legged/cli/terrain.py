@@ -23,7 +23,7 @@ from legged.terrain import Terrain, check_terrain, terrain_types
     "legged terrain anymal_c --types gap,pit,waves --difficulty 0.7",
     arguments=(
         *TASK,
-        argument("--types", help="types side by side instead of the task's own grid, e.g. stairs_up,gap"),
+        argument("--types", help="terrain types to show side by side instead of the task's grid, e.g. stairs_up,gap"),
         argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1"),
         argument("--out", type=Path, default=Path("."), help="folder for the two PNG files"),
     ),
@@ -39,13 +39,13 @@ def terrain(args: argparse.Namespace) -> int:
         raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")
     cfg = task_config(args.task, overrides(args), on_cpu=True)
     if not isinstance(cfg, LeggedConfig):
-        raise ConfigError(f"TASK: '{args.task}' has no terrain to show; its ground is that of its model")
+        raise ConfigError(f"TASK: '{args.task}' has no terrain to show, because its ground is part of its model")
     ready_to_write(args.out)
     if args.types is None:
         if cfg.terrain.mesh_type == "plane":
             raise ConfigError(
-                f"{args.task}: stands on a plane (terrain.mesh_type), there is no terrain to show; --types shows types of"
-                " your choice"
+                f"{args.task}: has no terrain to show, because its ground is a plane (terrain.mesh_type); --types shows"
+                " types of your choice"
             )
         check_terrain(cfg.terrain, cfg.origins)
         grid = Terrain.build(cfg.terrain, cfg.env.seed)
@@ -55,7 +55,8 @@ def terrain(args: argparse.Namespace) -> int:
         types = terrain_types("--types", args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
         check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
-        grid = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)  # the map's first column is the rightmost
+        # The first column of the grid is the rightmost one in the picture.
+        grid = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)
         levels = [f"{args.difficulty:g}"]
     make_folder(args.out)
     map_path, picture_path = args.out / "terrain_map.png", args.out / "terrain.png"

@@ -66,9 +66,9 @@ ROOM_MB = 16.0
     arguments=(
         *of_legged_gym("task"),
         argument("--resume", action="store_true", help="continue from a checkpoint, in a new run folder"),
-        argument("--transfer", metavar="POLICY", help="begin with the networks of another training, also of another task"),
+        argument("--transfer", metavar="POLICY", help="begin with the networks of another training, of any task"),
         argument("--teacher", metavar="POLICY", help="policy that a student imitates (train.distillation.teacher)"),
-        argument("--run-name", help="appended to the run folder's name"),
+        argument("--run-name", help="text that is appended to the run folder's name"),
         argument("--max-iterations", type=int, help="length of the whole training"),
         argument("--note", help="a sentence about this run, for its report and the table of all runs"),
         argument("--rl-device", help="device of the networks; that of the simulation by default"),
@@ -90,7 +90,7 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
     if args.transfer:
         for option in ("resume", "load_run"):
             if getattr(args, option):
-                raise ConfigError(f"--{option.replace('_', '-')}: continues a training, --transfer begins one; give either")
+                raise ConfigError(f"--{option.replace('_', '-')}: continues a training, --transfer begins one; leave one out")
         cfg, checkpoint = transferred(args.task, overrides(args), args.transfer, args.checkpoint, on_cpu)
     elif args.resume or args.load_run is not None or args.checkpoint is not None:
         cfg, checkpoint, changed = resumed(args.task, overrides(args), args.load_run, args.checkpoint)
@@ -148,7 +148,7 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
             training.close(folder, finished)
     if finished:
         return 0
-    # No signal of this process: its output was lost, or another process was told to stop.
+    # Without a signal to this process, its output was lost, or a signal stopped another process.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
@@ -177,7 +177,7 @@ def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespac
     """
     if not learns_from_teacher(cfg):
         if args.teacher is not None:
-            learns = "train.algorithm.class_name=Distillation would"
+            learns = "set train.algorithm.class_name=Distillation to change that"
             raise ConfigError(f"--teacher: '{cfg.task}' learns from rewards, not from a teacher; {learns}")
         return None
     return find_teacher(cfg) if checkpoint is None else teacher_in(checkpoint, read_checkpoint(checkpoint))
@@ -185,7 +185,7 @@ def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespac
 
 @dataclass
 class _Training:
-    """A training that has been built, in one of its processes. The first has a run folder and a display."""
+    """A training that is ready to run, in one of its processes. Only the first process has a run folder and a display."""
 
     args: argparse.Namespace
     cfg: TaskConfig
@@ -204,8 +204,8 @@ class _Training:
         return evaluations
 
     def learn(self, display: Display | None) -> tuple[Path | None, bool]:
-        """Train into a new run folder; return the folder (None if another process has it) and True if training reached its
-        end.
+        """Train into a new run folder; return the folder (None if another process has it), and True if the training
+        reached its end.
 
         A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its
         times into the folder.
@@ -236,7 +236,7 @@ class _Training:
             discard_run(folder)
             if folder.is_dir():
                 said = "" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
-                # A full disk may prevent that, and the name of a broken CUDA device can't be read.
+                # Writing fails on a full disk, and reading the name of a broken CUDA device fails.
                 with contextlib.suppress(RunError, RuntimeError):
                     write_timing(folder, self.timing(False, " ".join(said.split())[:500]))
                     self._report(folder, film=False)
@@ -286,9 +286,9 @@ class _Training:
     def _report(self, folder: Path, film: bool) -> None:
         """Write the report on a training that has ended, unless its configuration switches reports off."""
         if self.cfg.train.runner.report:
-            from legged.evaluation.reports.run_report import report_at_end  # imported late: a start does not need it
+            from legged.evaluation.reports.run_report import report_at_end  # imported late, because a start does not need it
 
-            # The arguments with which the process that makes the film finds the task.
+            # The process that makes the film needs --import to find the task.
             report_at_end(folder, given_import(self.args) if film and self.cfg.train.runner.film else None)
 
 
@@ -318,7 +318,7 @@ def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str
     newest = False
     if not cfg.train.runner.experiment_name:
         with contextlib.suppress(ConfigError, OSError):
-            newest = find_run(cfg, None) == folder  # otherwise another training of this task runs at the same time
+            newest = find_run(cfg, None) == folder  # False if another training of this task runs at the same time
     if not newest:
         return shlex.join([*program("play"), *given_import(args), relative(folder)])
     module = ["--import", args.module] if args.module else []

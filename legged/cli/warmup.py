@@ -1,4 +1,4 @@
-"""`legged warmup`: kernels are compiled before a training."""
+"""`legged warmup`: compilation of kernels before a training."""
 
 import argparse
 import time
@@ -20,7 +20,7 @@ def warmup(args: argparse.Namespace) -> int:
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
     if resolve_physics(cfg.sim.physics, device, num_envs=cfg.env.num_envs) == "mujoco":
-        print(f"{cfg.task}: nothing to do, C MuJoCo compiles no kernels")
+        print(f"{cfg.task}: nothing to do, because C MuJoCo compiles no kernels")
         return 0
     settle_on(device)
     make_task(cfg, device, graph=not args.no_graph)

@@ -37,8 +37,8 @@ ROBOTS_A_THREAD = 4
         CHECKPOINT,
         *BUILD,
         *TILES,
-        argument("--host", default=HOST, help="address that is listened at; this machine alone by default"),
-        argument("--port", type=int, help=f"{PORT}, or the next one that is free, by default"),
+        argument("--host", default=HOST, help="address to listen at; by default only this machine can connect"),
+        argument("--port", type=int, help=f"port of the page; by default {PORT}, or the next free one"),
     ),
 )
 def watch(args: argparse.Namespace) -> int:
@@ -53,7 +53,7 @@ def watch(args: argparse.Namespace) -> int:
     count = ROBOTS if args.num_envs is None else args.num_envs
     if not 1 <= count <= MOST_ROBOTS:
         raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}")
-    device = pick_device(args.sim_device or "cpu")  # a GPU belongs to the training
+    device = pick_device(args.sim_device or "cpu")  # a GPU is left to the training
     settle_on(device)
     asked = policy_overrides(args)
     watched = find_watched(args.policy, args.checkpoint)
@@ -68,7 +68,7 @@ def watch(args: argparse.Namespace) -> int:
     try:
         print(session.title(), flush=True)
         if not is_loopback(args.host):
-            open_to_all = "whoever reaches this machine can watch and steer; nobody is asked for a password"
+            open_to_all = "everyone who reaches this machine can watch and steer, without a password"
             print(f"warning: --host {args.host}: {open_to_all}", file=sys.stderr, flush=True)
         print(f"watch it at {url(args.host, page.port)} (Ctrl-C ends it)", flush=True)
         page.run()

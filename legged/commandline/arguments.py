@@ -38,7 +38,7 @@ BUILD = (
     argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default"),
     argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one"),
     argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph"),
-    argument("overrides", nargs="*", metavar="key=value", help="any field, e.g. rewards.scales.torques=-1e-4"),
+    argument("overrides", nargs="*", metavar="key=value", help="any setting, e.g. rewards.scales.torques=-1e-4"),
 )
 """Arguments that determine how a task is built: --import, engine, devices, and `key=value` overrides."""
 TASK = (argument("task", metavar="TASK", help=TASK_HELP), *BUILD)
@@ -55,8 +55,8 @@ TILES = (
 
 
 def of_legged_gym(name: str) -> tuple[Argument, ...]:
-    """Return the arguments of `train` and `play` that legged_gym has too: --task in place of the positional argument `name`,
-    and the options that name one of the task's runs.
+    """Return the arguments of `train` and `play`: the positional argument `name` or in its place legged_gym's --task, the
+    options that name one of the task's runs, and those of `BUILD`.
     """
     return (
         argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP),
@@ -94,10 +94,10 @@ def override_is_no_name(args: argparse.Namespace, name: str) -> None:
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """Return all overrides of a command line; flags come after `key=value`s.
+    """Return all overrides of a command line, first those of the form `key=value`, then those of flags.
 
     Raises:
-        ConfigError: a text is not of the form `key=value`, or --solver is given for an engine that has none.
+        ConfigError: a text is not of the form `key=value`, or --solver is given for another engine than newton.
     """
     flags = {
         "num_envs": "env.num_envs",
@@ -132,7 +132,7 @@ def velocity_command(text: str) -> tuple[float, float, float]:
     """Return vx, vy [m/s] and yaw rate [rad/s] of --command.
 
     Raises:
-        ConfigError: they are not three numbers, or one is too large.
+        ConfigError: the text is not three numbers, or one of them is above 100.
     """
     try:
         vx, vy, yaw = (float(part) for part in text.split(","))
@@ -147,7 +147,7 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     """Return the requested device, or the GPU if there is one; under torchrun, the GPU with this process's number.
 
     Raises:
-        ConfigError: there is no such device, there is no GPU, or under torchrun another GPU is requested than the process's.
+        ConfigError: the device does not exist, or under torchrun it is a GPU that is not this process's.
     """
     ranks, gpus = Ranks.now(), torch.cuda.device_count()
     own = f"cuda:{ranks.local_rank}"
@@ -156,10 +156,10 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     if name is None or (ranks.several and name == "cuda"):
         name = own
     if ranks.several and name not in ("cpu", own):
-        raise ConfigError(f"{flag}: '{name}' is one device for {ranks.count} processes; leave it out, and each gets its own")
+        raise ConfigError(f"{flag}: '{name}' is one device for {ranks.count} processes; without the flag each gets its own")
     if ranks.several and name == own and 0 < gpus <= ranks.local_rank:
         raise ConfigError(
-            f"{ranks.local_count} processes want a GPU each, but torch sees {gpus} here; --nproc-per-node {gpus}"
+            f"{ranks.local_count} processes need a GPU each, but torch sees {gpus} here; use --nproc-per-node {gpus}"
         )
     try:
         device = torch.device(name)
@@ -170,7 +170,7 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     if device.type != "cuda":
         raise ConfigError(f"{flag}: '{name}' is not supported (allowed: cpu, cuda, cuda:0, ...)")
     if not torch.cuda.is_available():
-        raise ConfigError(f"{flag}: '{name}' was asked for, but torch sees no GPU here; leave it out to use the CPU")
+        raise ConfigError(f"{flag}: '{name}' was asked for, but torch sees no GPU here; without the flag the CPU is used")
     if (device.index or 0) >= gpus:
         raise ConfigError(f"{flag}: '{name}': this machine has {gpus} GPU(s), counted from 0")
     return torch.device("cuda", device.index or 0)
@@ -179,15 +179,15 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
 def settle_on(device: torch.device) -> None:
     """Configure torch for a command that runs on `device`."""
     if device.type == "cpu":
-        # The C engine uses the cores; torch's small tensors are slower when its own threads compete for them.
+        # The C engine uses all cores. If torch's threads compete for them, operations on small tensors become slower.
         torch.set_num_threads(1)
     else:
         torch.cuda.set_device(device)  # operations without a device must not run on the first GPU
 
 
 def measuring_device(args: argparse.Namespace) -> torch.device:
-    """Return the device of a command that measures a policy, on which torch is then settled: that of --sim-device; without
-    it the CPU for `--physics mujoco`.
+    """Return the device of a command that measures a policy, and configure torch for it. Without --sim-device it is the CPU
+    for `--physics mujoco`, else the GPU if there is one.
 
     Raises:
         ConfigError: as `pick_device`.
@@ -205,7 +205,7 @@ def watch_command(args: argparse.Namespace, folder: Path) -> str:
 
 
 def given_import(args: argparse.Namespace) -> list[str]:
-    """Return the --import option with which another command finds the user-defined tasks of this command."""
+    """Return the --import option by which another command would register the user-defined tasks of this command."""
     files = [file for file in (args.module, args.task_file) if file]
     return ["--import", ",".join(files)] if files else []
 

@@ -54,7 +54,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         leaves = None
         try:
             code = _guarded(main, argv)
-        except SystemExit as stop:  # from argparse, after --help or a wrong flag
+        except SystemExit as stop:  # argparse raises it after --help or a wrong flag
             leaves, code = stop, stop.code if isinstance(stop.code, int) else 0
         output.flush()
         if output.lost is not None:
@@ -63,12 +63,12 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         elif leaves is not None:
             raise leaves
     if argv is None:
-        leave_at_interrupts()  # until Python itself has ended
+        leave_at_interrupts()  # no traceback if Ctrl-C comes while Python ends
     return code
 
 
 def _engine_warnings() -> AbstractContextManager[None]:
-    """Return a context in which each kind of MuJoCo's warnings is printed once; help and lists do without MuJoCo."""
+    """Return a context in which each kind of MuJoCo's warnings is printed once; help and lists do not import it."""
     if "mujoco" not in sys.modules:
         return nullcontext()
     from legged.physics.engine_warnings import each_warning_once
@@ -77,11 +77,11 @@ def _engine_warnings() -> AbstractContextManager[None]:
 
 
 class SubCommand:
-    """A command that is a function of parsed arguments: `legged <module> <function>`, or `legged <module>` if it is called
-    like its module in `legged.cli`. In a name, `_` is a hyphen, and one at the end is left out.
+    """A command that runs a function of parsed arguments. It is called `legged <module> <function>`, or `legged <module>` if
+    the function has the name of its module in `legged.cli`. A `_` in a name becomes a hyphen; at the end it is left out.
 
-    In the arguments, `words` is the whole command line, and `start_s` the start of the command on the clock of
-    `time.perf_counter` [s]; the start of a process includes its imports.
+    The arguments also have `words`, the list of words of the command line, and `start_s`, the start of the command on the
+    clock of `time.perf_counter` [s]. If the command is the whole process, its start comes before the imports.
     """
 
     def __init__(self, run: Callable[..., int], examples: Sequence[str], arguments: Sequence[Argument]) -> None:
@@ -95,20 +95,20 @@ class SubCommand:
         return CommandParser(" ".join(["legged", *words]), described, *self._examples, arguments=self._arguments)
 
     def parse(self, argv: list[str] | None) -> argparse.Namespace:
-        """Return the arguments of a command line, of this process if None."""
+        """Return the parsed arguments of the command line `argv`, or of this process if it is None."""
         args = self.build_parser().parse_intermixed_args(argv)
         args.words = sys.argv[1:] if argv is None else argv
         args.start_s = STARTED_S if argv is None else time.perf_counter()
         return args  # type: ignore[no-any-return]
 
     def main(self, argv: list[str] | None = None) -> int:
-        """Run the command with these arguments, those of this process if None; return its exit code."""
+        """Run the command with the arguments `argv`, or those of this process if it is None; return the exit code."""
         return run_main(lambda words: self.run(self.parse(words)), argv)
 
 
 def sub_command(*examples: str, arguments: Sequence[Argument] = ()) -> Callable[[Callable[..., int]], SubCommand]:
-    """Make a function of parsed arguments a sub-command, whose exit code it returns. Its docstring is the description of the
-    help, which ends with `examples`.
+    """Make a sub-command of a function that takes parsed arguments and returns an exit code. The function's docstring is the
+    description in the help, which ends with `examples`.
     """
     return lambda run: SubCommand(run, examples, arguments)
 
@@ -130,7 +130,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
         return INTERRUPTED
     except MemoryError as error:
         _say(f"out of memory: {error}" if str(error) else NO_MEMORY)
-    except Exception as error:  # libraries report a full disk, too little memory and Ctrl-C by classes of their own
+    except Exception as error:  # libraries have their own errors for full disks, full memory and Ctrl-C
         if isinstance(error.__context__, KeyboardInterrupt):
             print("interrupted", file=sys.stderr, flush=True)
             return INTERRUPTED
@@ -188,7 +188,7 @@ def _say(text: str) -> None:
     """Print the reason why the command ends."""
     try:
         rank = f"rank {Ranks.now().rank}: " if Ranks.now().several else ""
-    except ConfigError:  # the number of the process is itself wrong, which is the error
+    except ConfigError:  # the error to print may be about the rank itself
         rank = ""
     print(f"{rank}error: {text}", file=sys.stderr, flush=True)
 
@@ -201,7 +201,7 @@ class Output:
 
     def __init__(self, stream: TextIO | None) -> None:
         """Wrap `stream`, which is None in a process that was started without one."""
-        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (as long as the process)
+        self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (open until the process ends)
         self.lost: str | None = None
         """Reason why nothing more can be written; None while writing works."""
         self._when_lost: list[Callable[[], object]] = []
@@ -220,7 +220,7 @@ class Output:
                 self._stream.flush()
 
     def when_lost(self, do: Callable[[], object]) -> None:
-        """Call `do` as soon as nothing can be written any more; at once, if that is already so."""
+        """Call `do` as soon as nothing can be written any more; at once, if writing already fails."""
         if self.lost is not None:
             do()
         self._when_lost.append(do)
@@ -260,7 +260,7 @@ def when_output_is_lost(do: Callable[[], object]) -> None:
 
 @contextmanager
 def forgiving_output() -> Iterator[Output]:
-    """Make losses of standard output and standard error of this process silent; yield the wrapped standard output."""
+    """Discard text once it can't be written to standard output or standard error; yield the wrapped standard output."""
     streams = sys.stdout, sys.stderr
     output = Output(sys.stdout)
     sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
@@ -277,12 +277,12 @@ def forgiving_output() -> Iterator[Output]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Call `stop` at the first signal, which ends the training after the iteration; raise KeyboardInterrupt at the second.
+    """Call `stop` at the first signal, which ends a training after its iteration; raise KeyboardInterrupt at the second.
     Yield a list that collects the signals. The earlier handlers are restored afterwards.
 
-    With several processes, all stop as soon as one is told to. There a second signal has no effect: torchrun passes on the
-    signals that the terminal has already sent, and kills processes that take more than half a minute. Outside the main thread
-    Python can't handle signals, so none are handled.
+    With several processes, all stop as soon as one receives a signal. There a second signal has no effect, because torchrun
+    passes on the signal that the terminal has already sent to each process. torchrun kills processes that take more than half
+    a minute to end. Outside the main thread signals keep their handlers, because Python can't set others there.
     """
     received: list[int] = []
     ranks = Ranks.now()
@@ -292,7 +292,7 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
         if len(received) > 1 and not ranks.several:
             raise KeyboardInterrupt
         if len(received) == 1 and ranks.first:
-            once_more = "" if ranks.several else "; once more to stop at once"
+            once_more = "" if ranks.several else "; a second signal stops it at once"
             with suppress(RuntimeError):  # the signal came during another write to the same stream
                 print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
         stop()

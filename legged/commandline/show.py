@@ -43,7 +43,7 @@ def _says(task: BaseTask, method: str) -> str:
 
 
 def _table(title: str, *rows: tuple[str, ...]) -> Iterator[str]:
-    """Yield a title and rows in columns; the last column has any width."""
+    """Yield a title and rows in columns; the last column is not padded."""
     yield from ("", title)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths[-1] = 0
@@ -55,7 +55,7 @@ _number = "{:.6g}".format
 
 
 def _robot(task: BaseTask) -> Iterator[str]:
-    """Yield the size of a legged robot, and the factors by which numbers were rescaled from their reference robot."""
+    """Yield the size of a legged robot, and the factors by which settings written for another robot are rescaled."""
     if not isinstance(task, LeggedRobot):
         return
     size = Size(task.robot.mass, task.robot.height)
@@ -89,7 +89,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
 
 def _rewards(task: BaseTask) -> Iterator[str]:
     scales = task.cfg.rewards.scales
-    times = f"times the control step of {task.dt:g} s" if task.cfg.rewards.times_dt else "a control step"
+    times = f"times the control step of {task.dt:g} s" if task.cfg.rewards.times_dt else "per control step"
     rows = [("reward", "scale", "what it is")]
     rows += [(name, _number(scales[name]), _says(task, f"_reward_{name}")) for name in task.rewards.names]
     off = [name for name, scale in scales.items() if scale == 0.0]
@@ -171,7 +171,7 @@ def _effect(task: BaseTask, i: int) -> str:
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
     bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
-    # a servo, a muscle or a motor of a tendon: its force is not a plain multiple of its control
+    # The force of a servo, a muscle or a tendon's motor is not a fixed multiple of the control.
     if not on_joint or not gains or bias:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])

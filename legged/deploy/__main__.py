@@ -1,7 +1,8 @@
 """The robot's program: `python -m legged.deploy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
-It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at its rate, under the keyboard, a gamepad
-or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra `unitree-sdk2` too.
+It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at the policy's rate, follows the keyboard,
+a gamepad or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra
+`unitree-sdk2` too.
 """
 
 import argparse
@@ -35,15 +36,15 @@ PROGRAM = (
     argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard"),
     argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}"),
     argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad"),
-    argument("--seconds", type=float, default=float("inf"), help="end after so long; at the operator's word by default"),
+    argument("--seconds", type=float, default=float("inf"), help="end after this time [s]; default: when the operator quits"),
     argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3"),
-    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop beyond this [rad]; default {Limits.max_tilt:g}"),
-    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop at older data [s]; default {Limits.max_age_s:g}"),
+    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop beyond this tilt [rad]; {Limits.max_tilt:g}"),
+    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop if data are older [s]; {Limits.max_age_s:g}"),
     argument(
         "--max-missed",
         type=int,
         default=Limits.max_missed,
-        help=f"stop at so many missed in a row; default {Limits.max_missed}",
+        help=f"stop at this number of missed deadlines in a row; default {Limits.max_missed}",
     ),
 )
 """Options of the program that do not depend on the robot."""
@@ -74,8 +75,8 @@ def build_parser() -> CommandParser:
             argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and policy.json"),
             *PROGRAM,
             argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}"),
-            argument("--network", help="network interface of a robot of Unitree's, e.g. eth0; found by itself by default"),
-            argument("--domain", type=int, default=0, help="DDS domain: 0 a robot, 1 Unitree's own simulator; default 0"),
+            argument("--network", help="network interface to a Unitree robot, e.g. eth0; found automatically by default"),
+            argument("--domain", type=int, default=0, help="DDS domain: 0 for a robot, 1 for Unitree's simulator; default 0"),
             argument("--log", type=Path, default=Path("deploy_log.npz"), help="file of the log; default deploy_log.npz"),
         ),
     )
@@ -88,17 +89,17 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError(f"--robot: '{args.robot}' is unknown{suggest(args.robot, [*KINDS, 'udp:HOST:PORT'])}")
     try:
         fits = args.log.suffix == ".npz" and not args.log.is_dir()
-    except OSError:  # such as a name that is too long
+    except OSError:  # the name may be too long
         fits = False
     if not fits:
         raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
     ready_to_write(args.log.parent)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # refuse a policy that does not fit before the robot leaves its own controller
+    if args.robot in KINDS:  # a wrong policy is refused before the robot leaves its own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
-    hurries = take_priority()  # before a robot's SDK starts threads, which inherit the priority
+    hurries = take_priority()  # the threads of a robot's SDK start later, and inherit the priority
     with ExitStack() as opened:
         opened.callback(operator.close)
         if args.robot in KINDS:
@@ -110,7 +111,7 @@ def _main(argv: list[str] | None) -> int:
         program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
         opened.pop_all()  # the program closes them
     sys.setswitchinterval(SWITCH_S)
-    hurry = "with priority" if hurries else "without priority: cycles may begin late on a busy machine (rtprio)"
+    hurry = "with priority" if hurries else "without priority (rtprio), so cycles may begin late on a busy machine"
     tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")
     try:
         program.run(args.seconds)
@@ -125,7 +126,7 @@ def _main(argv: list[str] | None) -> int:
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """Return the limits of the flags, in seconds, radians and cycles; degrees or milliseconds are refused.
+    """Return the limits that the flags set, in seconds, radians and cycles. The ranges exclude degrees and milliseconds.
 
     Raises:
         ConfigError: a number is outside its range.
@@ -140,7 +141,7 @@ def limits_of(args: argparse.Namespace) -> Limits:
 
 
 def make_operator(args: argparse.Namespace) -> Operator:
-    """Return the operator of the flags.
+    """Return the operator that the flags choose.
 
     Raises:
         ConfigError: the file, device or terminal does not exist.

@@ -18,7 +18,7 @@ CONTRACT_VERSION = 1
 CHECKSUMS = "sha256"
 """Key of policy.json: file of the export -> its SHA-256 in hexadecimal digits. Older exports lack the key."""
 NOT_COMPARED = {CHECKSUMS, "iterations", "wall_s"}
-"""Keys of policy.json that may differ from the metadata of the ONNX file: its own checksum, and the marks of a training."""
+"""Keys of policy.json that may differ from the metadata of the ONNX file: the checksums, and the length of the training."""
 SENSORS = {
     "base_ang_vel": "gyro",
     "projected_gravity": "quaternion",
@@ -29,17 +29,17 @@ SENSORS = {
 }
 """Observation term -> sensor, command or memory that it needs, for the terms that every robot can provide."""
 SOURCE = "source "
-"""Prefix of the needs of all other terms: a source of that name, such as an estimator or a map."""
+"""Prefix of the need of every other term. The name of a source follows, such as an estimator or a map."""
 SCANS = ("lowest", "own", "highest")
 """Values that a point of the heights can read: the lowest of its cell and the next cells in x and y, its own cell's, or the
 highest of the three."""
 TOLERANCE = 1e-3
 """Largest difference, absolute or relative, at which limits count as equal."""
 DEEPEST, MOST_DIGITS = 20, 18
-"""Deepest nesting and longest whole number in JSON from outside."""
+"""Deepest nesting, and largest number of digits of a whole number, in JSON from files and packets."""
 RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "stiffness": ("0 or more", lambda x: x >= 0.0),
-    "damping": ("above 0: it is what stops a robot", lambda x: x > 0.0),
+    "damping": ("above 0, because damping stops the robot", lambda x: x > 0.0),
     "torque_limits": ("above 0", lambda x: x > 0.0),
     "velocity_limits": ("above 0", lambda x: x > 0.0),
     "action_clip": ("above 0 and finite", lambda x: x > 0.0),
@@ -82,7 +82,7 @@ def need_of(term: str) -> str:
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the observation in the columns `start` to `start + size` of the oldest observation of its group."""
+    """A term of the observation. In the oldest observation of its group it has the columns `start` to `start + size`."""
 
     name: str
     start: int
@@ -100,7 +100,7 @@ class Term:
     deepest: float
     """Largest observed depth of low ground [m]."""
     scan: str
-    """Value that a point reads of a map of cells, one of `SCANS`."""
+    """Value that a point reads from a map of cells, one of `SCANS`."""
 
 
 @dataclass(frozen=True)
@@ -174,20 +174,20 @@ class Contract:
         return {term.source: term for term in self.terms if term.source is not None}
 
     def check_metadata(self, network: Path, metadata: Mapping[str, str]) -> None:
-        """Compare all entries with the metadata of the ONNX file `network`, JSON texts by key.
+        """Compare all entries with `metadata` of the ONNX file `network`, which are JSON texts by key.
 
         Raises:
-            ConfigError: the metadata are no contract, or those of another export.
+            ConfigError: the metadata are no contract, or come from another export.
         """
         try:
             inside = {key: plain_json(text) for key, text in metadata.items() if key not in NOT_COMPARED}
         except ValueError:
             inside = {}
         if "contract_version" not in inside:
-            raise ConfigError(f"{network}: has no metadata of an export, which must be the entries of {self.path}")
+            raise ConfigError(f"{network}: has no metadata of an export; they must equal {self.path}")
         for key in sorted({*inside, *self.entries} - NOT_COMPARED):
             if key not in inside or key not in self.entries or inside[key] != self.entries[key]:
-                raise ConfigError(f"{self.path}: {key}: is not that of {network}: they are of different exports")
+                raise ConfigError(f"{self.path}: {key}: differs from that of {network}; the files are of different exports")
 
     def check_fits(self, robot: RobotFacts) -> None:
         """Compare with a robot.
@@ -218,17 +218,17 @@ class Contract:
             if source not in robot.offers:
                 offered = ", ".join(sorted(robot.offers)) or "none"
                 raise ConfigError(
-                    f"{self.path}: observation: '{robot.name}' has nothing that gives '{term.name}', which no sensor measures"
-                    f" (sources it offers: {offered})"
+                    f"{self.path}: observation: no sensor measures '{term.name}', and '{robot.name}' has no source for it"
+                    f" (sources: {offered})"
                 )
 
 
 def read_contract(path: Path) -> Contract:
-    """Return the contract in a policy.json, after a comparison of the exported files next to it with its checksums.
+    """Return the contract in a policy.json, after checking the exported files next to it against its checksums.
 
     Raises:
         ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
-            invalid values; or an exported file is not the one that was written with it.
+            invalid values; or an exported file does not have its checksum.
     """
     try:
         said = plain_json(path.read_bytes())
@@ -249,7 +249,7 @@ def read_contract(path: Path) -> Contract:
         for name, digest in said.get(CHECKSUMS, {}).items():
             file = path.with_name(name)
             if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-                raise ConfigError(f"{file}: is not the file that was exported with {path} ({CHECKSUMS}): export it again")
+                raise ConfigError(f"{file}: is not the file that was exported with {path} ({CHECKSUMS}); export it again")
     except ConfigError:
         raise
     except (OSError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
@@ -281,7 +281,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         raise ConfigError(f"{path}: joint_names: must differ from each other")
     limits = np.array([(-np.inf, np.inf) if pair is None else pair for pair in said["position_limits"]], dtype=float)
     low, high = limits.reshape(count, 2).T
-    check("position_limits", "below the upper ones", low < high, low)
+    check("position_limits", "below the upper limits", low < high, low)
     default = numbers("default_joint_angles", count)
     crouch = None if said["crouch_joint_angles"] is None else numbers("crouch_joint_angles", count)
     for key, pose in (("default_joint_angles", default), ("crouch_joint_angles", crouch)):
@@ -289,7 +289,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
             check(key, "within position_limits", (low - TOLERANCE <= pose) & (pose <= high + TOLERANCE), pose)
     ranges = np.array([said["command_ranges"][name] for name in ("vx", "vy", "yaw_rate")], dtype=float).reshape(3, 2)
     right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
-    check("command_ranges", "finite, and not above the upper ones", right, ranges[:, 0])
+    check("command_ranges", "finite, and not above the upper limits", right, ranges[:, 0])
     control_dt, sim_dt = numbers("control_dt"), np.array(said.get("sim_dt", said["control_dt"]), dtype=float)
     check("sim_dt", "above 0, and at most control_dt", (sim_dt > 0.0) & (sim_dt <= control_dt + 1e-9), sim_dt)
     return Contract(
@@ -321,13 +321,13 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
 
 
 def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]:
-    """Yield the groups, whose terms a robot with so many joints can make, and which lie side by side without gaps."""
+    """Yield the groups. Check that a robot with this number of joints can give their terms, and that columns have no gaps."""
     sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
     sizes["actions"] = len(said["action_joints"])
     names = [entry["name"] for entry in said["observation_groups"]]
     for entry in said["observation"]:
         if entry["group"] not in names:
-            raise ConfigError(f"{where}: '{entry['name']}' lies outside its group '{entry['group']}'")
+            raise ConfigError(f"{where}: the group '{entry['group']}' of '{entry['name']}' does not exist")
     start = 0
     for entry in said["observation_groups"]:
         size, history, column = int(entry["size"]), int(entry["history"]), start
@@ -353,7 +353,7 @@ def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Ter
     scale, points = np.array(entry["scale"], dtype=float), np.array(entry.get("points") or (), dtype=float).reshape(-1, 2)
     scan = str(entry.get("scan", SCANS[0]))
     if source is None and needs != SENSORS.get(name):
-        raise ConfigError(f"{where}: '{name}' needs '{needs}', which it is not made of")
+        raise ConfigError(f"{where}: '{name}' cannot be made from '{needs}'")
     if source is None and size != sizes[name]:
         raise ConfigError(f"{where}: '{name}' has {size} numbers, a robot gives {sizes[name]}")
     if scale.shape != (size,) or not np.isfinite(scale).all():
@@ -381,6 +381,6 @@ def _difference(wanted: Sequence[str], there: Sequence[str], robot: str) -> str:
     if missing := [name for name in wanted if name not in there]:
         return f"'{robot}' has no joint '{missing[0]}' (its joints: {', '.join(there)})"
     if more := [name for name in there if name not in wanted]:
-        return f"the policy knows no joint '{more[0]}', which '{robot}' has"
+        return f"'{robot}' has a joint '{more[0]}' that the policy does not know"
     place = next(i for i, (a, b) in enumerate(zip(wanted, there, strict=True)) if a != b)
-    return f"joint {place} is '{wanted[place]}' for the policy and '{there[place]}' for '{robot}': another order"
+    return f"joint {place} is '{wanted[place]}' for the policy and '{there[place]}' for '{robot}'; their orders differ"

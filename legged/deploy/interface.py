@@ -53,13 +53,13 @@ class Reading:
 
 
 class Interface(ABC):
-    """A robot or a simulated one."""
+    """A real or a simulated robot."""
 
     facts: RobotFacts
 
     @abstractmethod
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Request sources from now on; `heights` comes with its points (P, 2), x forward and y left of the base [m]."""
+        """Request sources from now on: `heights` -> its points (P, 2), x forward, y left of the base [m]; others -> None."""
 
     @abstractmethod
     def read(self) -> list[Reading]:

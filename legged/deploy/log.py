@@ -16,9 +16,9 @@ from legged.process.paths import make_folder, replacing
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Rows that are kept, the newest ones: twenty minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
+"""Numbers of newest rows that are kept: 20 minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
 SHORTEST = 20
-"""Smallest number of samples in a run of the samples for fitting."""
+"""Smallest number of samples without a gap that is used for fitting."""
 UNEVEN = 0.75
 """Largest deviation of the time between two samples, as a share of a time step. A clock with a resolution of 1 ms alternates
 between 2 and 3 ms at 400 Hz; a missing sample adds a whole step."""
@@ -77,7 +77,7 @@ class Log:
         Arrays by reading: `times` of the robot's clock [s], `received` of this machine's clock [s], `targets` (T, D) [rad],
         `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] and `temperatures` [degrees Celsius],
         both NaN if unknown, `quaternions` (T, 4), `gyro` (T, 3), and `state` (T,), an index into `states`. Arrays by cycle:
-        the values of `add_cycle`, with the prefix `cycle_`. The rest: `joint_names`, `states`, `notes`, `note_times` [s] and
+        the values of `add_cycle`, with the prefix `cycle_`. Others: `joint_names`, `states`, `notes`, `note_times` [s] and
         `contract` (JSON). Samples for fitting actuators, if there are any, go to a second file with the suffix `ACTUATORS`.
 
         Raises:
@@ -96,15 +96,15 @@ class Log:
         beside, samples = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
         with replacing(path) as part:
             np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-            beside.unlink(missing_ok=True)  # left by another run
+            beside.unlink(missing_ok=True)  # another run may have left it
         if samples is not None:
             with replacing(beside) as part:
                 np.savez_compressed(part, allow_pickle=False, **samples)  # type: ignore[arg-type]
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
-    """Return the readings of a log (arrays of `Log.save`) that have the policy's gains and torques, evenly spaced; None
-    without such readings.
+    """Return the samples for fitting from a log (arrays of `Log.save`); None if it has too few. They are the evenly spaced
+    readings with the policy's gains and with torques.
 
     A missing reading ends a run; repeated readings are left out. The arrays are `joint_names` (D,), `run` (T,), `dt` [s],
     `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,).
@@ -116,7 +116,7 @@ def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[s
         usable &= np.isfinite(log[name]).all(axis=1)
     new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
     rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
-    if len(rows) < SHORTEST:  # or the robot has no clock
+    if len(rows) < SHORTEST:  # this is also so if the robot has no clock
         return None
     steps = np.diff(log["times"][rows])
     usual = float(np.median(steps))

@@ -54,7 +54,7 @@ TRANSITIONS = {
     State.WALK: (Event.STAND, Event.DAMPING, Event.STOP),
     State.STOP: (Event.DAMPING, Event.STOP),
 }
-"""State -> the events that lead to the state of their name; all others are refused."""
+"""State -> the allowed events, each of which leads to the state with the same name. All other events are refused."""
 MOVING = (State.STAND, State.WALK)
 """States in which the safety checks can stop the robot."""
 RAMP = np.array([1.0, 1.0, 2.0])
@@ -116,7 +116,7 @@ class Operator(ABC):
     def poll(self, seconds: float) -> Orders:
         """Return the orders `seconds` after the start of the program, without waiting."""
 
-    def close(self) -> None:  # noqa: B027  (most have nothing to release)
+    def close(self) -> None:  # noqa: B027  (most operators have nothing to release)
         """Release resources, such as a terminal."""
 
 
@@ -194,7 +194,7 @@ class Script(Operator):
 
 
 class _Device(Operator):
-    """An operator at an open device, whose command is a share of the largest one; a device that is closed counts as lost."""
+    """An operator with an open device, whose commands are shares of the largest command. A closed device counts as lost."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         self._descriptor, self._name = descriptor, name
@@ -229,7 +229,7 @@ class Keyboard(_Device):
         """
         super().__init__(sys.stdin.fileno() if descriptor is None else descriptor, "the terminal")
         if not os.isatty(self._descriptor):
-            raise ConfigError("--input: the keyboard needs a terminal; name a gamepad (gamepad) or a file (--commands)")
+            raise ConfigError("--input: the keyboard needs a terminal; use --input gamepad or --commands FILE")
         import termios
         import tty
 
@@ -257,7 +257,7 @@ class Keyboard(_Device):
     def close(self) -> None:
         import termios
 
-        with suppress(termios.error):  # the terminal may be closed; TCSANOW, because a held terminal never drains
+        with suppress(termios.error):  # the terminal may be closed. TCSANOW does not wait for a held terminal
             termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
 

@@ -22,13 +22,13 @@ def take_priority(priority: int = PRIORITY) -> bool:
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except (AttributeError, OSError):  # another system, or no permission
+    except (AttributeError, OSError):  # the system lacks the call, or refuses it
         return False
     return True
 
 
 class Pace:
-    """A clock of cycles that begin every `dt` after the first one, regardless of their durations."""
+    """A clock that begins a cycle every `dt` [s] after the first one, however long the cycles take."""
 
     def __init__(
         self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], object] = time.sleep
@@ -56,8 +56,8 @@ class Pace:
         return now
 
     def done(self) -> None:
-        """End a cycle. If it ends after the next one was due, it has missed its deadline and those of all overdue cycles,
-        which are skipped.
+        """End a cycle. If the next cycle is already due, a deadline is missed. Any further overdue cycles are skipped, and
+        their deadlines count as missed too.
         """
         assert self._due is not None
         now = self._clock()
@@ -95,7 +95,7 @@ class StatusMessages:
 
     def _run(self) -> None:
         while (line := self._lines.get()) is not None:
-            with suppress(OSError, ValueError):  # the terminal is closed
+            with suppress(OSError, ValueError):  # the terminal may be closed
                 self._say(line)
 
     def close(self) -> None:

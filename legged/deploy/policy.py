@@ -20,7 +20,7 @@ def gravity_in(quaternion: np.ndarray) -> np.ndarray:
 
 
 def open_onnx(path: Path) -> onnxruntime.InferenceSession:
-    """Return a session of an ONNX file in one thread, since a policy of one robot is too small for several.
+    """Return an onnxruntime session with one thread, because a policy of one robot is too small for several threads.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -30,7 +30,7 @@ def open_onnx(path: Path) -> onnxruntime.InferenceSession:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors have no class in common
+    except Exception as error:  # onnxruntime's errors have no class in common
         raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
 
 
@@ -83,7 +83,7 @@ class Policy:
         path = folder if folder.suffix == ".onnx" else folder / "policy.onnx"
         for needed in (path, path.with_name("policy.json")):
             if not needed.is_file():
-                raise ConfigError(f"POLICY: there is no {needed}: a folder with policy.onnx and policy.json is wanted")
+                raise ConfigError(f"POLICY: there is no {needed}; name a folder with policy.onnx and policy.json")
         self.contract = contract = read_contract(path.with_name("policy.json"))
         self._network = Network(path, contract)
         self._steps = [np.zeros((group.history, group.size)) for group in contract.groups]
@@ -92,8 +92,8 @@ class Policy:
         self.restart()
 
     def restart(self) -> None:
-        """Clear the hidden state, the last action and the histories; the next observation fills them, as the first one of an
-        episode does in training.
+        """Clear the hidden state, the last action and the histories; the next observation fills the histories, as
+        the first one of an episode does in training.
         """
         self._network.restart()
         self._begins = True

@@ -16,7 +16,7 @@ from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, Watch, braking, clamp_targets
 
 STANDS_WITHIN = 0.6
-"""Largest deviation of a joint from the default pose of a standing robot, whose weight causes part of it [rad]."""
+"""Largest deviation of a standing robot's joint from the default pose; the robot's weight causes a part of it [rad]."""
 THERE = 0.05
 """Largest deviation of a joint at which the robot counts as in the default pose and need not fold its legs [rad]."""
 FAR = 100.0
@@ -71,18 +71,18 @@ class Program:
         """Reasons of all stops, in order."""
         self._reading: Reading | None = None
         self._ticks = False
-        """The robot's clock has advanced between readings."""
+        """True once the robot's clock has advanced between two readings."""
         self._path, self._path_s = [contract.default], stand_s
         self._since = self._start = 0.0
         self.walked_s = 0.0
         """Time for which the policy acted [s]."""
         self._halting_s: float | None = None
-        """Time since which a robot that is about to stand has had the command zero [s]; None if it is not about to."""
+        """Time for which the command has been zero while a walking robot halts [s]; None if it does not halt."""
         self._asked = (np.zeros(len(contract.joint_names)),) * 3
         """Last targets and gains that were sent to the robot."""
 
     def run(self, seconds: float = np.inf) -> None:
-        """Run until the operator quits or for some time [s]; then brake and release the robot."""
+        """Run until the operator quits, or for `seconds`; then brake and release the robot."""
         collects = gc.isenabled()
         gc.freeze()
         gc.disable()  # a garbage collection takes longer than a cycle
@@ -132,8 +132,8 @@ class Program:
         return Event.QUIT in events
 
     def _read(self) -> None:
-        """Process and log the new readings. A reading with the same time as the previous one repeats that measurement, whose
-        age goes on growing. A stop request in any reading counts.
+        """Process and log the new readings. A reading with the same time as the previous one repeats that measurement, so
+        it keeps the earlier time of arrival. A stop request in any reading counts.
         """
         stops = False
         for reading in self._robot.read():
@@ -156,32 +156,32 @@ class Program:
             return
         if event is Event.WALK and self._halting_s is not None:
             self._halting_s = None
-            self._say("walk: it walks on", now)
+            self._say("walk: the robot walks on", now)
             return
         if event not in TRANSITIONS[self.state]:
-            self._say(f"refused: '{event.value}' leads nowhere from {self.state.value}", now)
+            self._say(f"refused: '{event.value}' is not possible in the state {self.state.value}", now)
         elif State(event.value) in MOVING and reason is not None:
             self._say(f"refused: {event.value}: {reason}", now)
         elif event is Event.WALK and now - self._since < self._path_s:
-            self._say(f"refused: walk: it stands up for {self._path_s:g} s first", now)
+            self._say(f"refused: walk: the robot first stands up, for {self._path_s:g} s", now)
         elif event is Event.WALK and (crooked := self._crooked()) is not None:
             self._say(f"refused: walk: {crooked}", now)
         elif self.state is State.WALK and event is Event.STAND:
             if self._halting_s is None:
                 self._halting_s = 0.0
-                self._say("walk: it halts, and then stands", now)
+                self._say("walk: the robot halts, and then stands", now)
         else:
             self._enter(State(event.value), now)
 
     def _crooked(self) -> str | None:
         """Return a message about the joint that is furthest from a standing pose; None if all are close to it."""
         if self._reading is None:
-            return "nothing has been read yet"
+            return "no reading has arrived yet"
         away = np.abs(self._reading.positions - self._contract.default)
         if away.max() <= STANDS_WITHIN:
             return None
         joint = self._contract.joint_names[int(away.argmax())]
-        return f"it does not stand: {joint} is {away.max():.2f} rad from its default angle (allowed: {STANDS_WITHIN:g})"
+        return f"the robot does not stand: {joint} is {away.max():.2f} rad from its default (allowed: {STANDS_WITHIN:g})"
 
     def _stop(self, reason: str, now: float) -> None:
         """Enter the state `stop` and report the reason."""
@@ -259,7 +259,7 @@ class Program:
             self.pace.done()
 
     def _settle_blindly(self) -> None:
-        """Send braking commands after a failure and ignore further failures; several, because one may get lost."""
+        """Send braking commands after a failure, several because one may get lost. Ignore further failures."""
         contract = self._contract
         for _ in range(int(np.ceil(SETTLE_S / contract.control_dt))):
             with suppress(Exception):

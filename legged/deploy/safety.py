@@ -9,11 +9,11 @@ from legged.deploy.interface import Reading
 from legged.deploy.policy import gravity_in
 
 SLOWEST_FALL = 0.5
-"""Share of a joint's largest speed at which braking needs its whole torque."""
+"""Speed at which braking takes the whole torque of a joint, as a share of the joint's largest speed."""
 AT_ONCE = 2.0
 """Factor on the allowed joint speed above which the robot is stopped at once."""
 MOST_DAMPING = 4.0
-"""Largest factor on the policy's D gain, at which the motors are known to be stable, for braking."""
+"""Largest D gain for braking, as a multiple of the policy's D gain, because motors may be unstable far above that gain."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Watch:
         self._contract, self.limits = contract, limits
         self._fastest = limits.speed_share * contract.velocity_limits
         self._fast_s = np.zeros(len(self._fastest))
-        """Time for which each joint was too fast, minus a quarter of the time for which it was not since [s]."""
+        """Time for which each joint was too fast [s]. A quarter of the time since then is subtracted, down to 0."""
         self._seen: float | None = None
 
     def see(self, reading: Reading) -> None:
@@ -60,7 +60,7 @@ class Watch:
         """
         limits = self.limits
         if reading is None:
-            return "no data: nothing has been read yet"
+            return "no data: no reading has arrived yet"
         if reading.stop:
             return "remote control: the operator asks for a stop"
         age = now - reading.received
@@ -86,7 +86,7 @@ class Watch:
         too_fast = at_once if at_once.any() else self._fast_s >= limits.fast_s
         if too_fast.any():
             i = int(too_fast.argmax())
-            how = f"turns at {reading.velocities[i]:.1f} rad/s" if at_once.any() else "has been faster than that"
+            how = f"turns at {reading.velocities[i]:.1f} rad/s" if at_once.any() else "has been faster for too long"
             return f"joint speed: {joints[i]} {how} (allowed: {self._fastest[i]:.1f} rad/s for {1e3 * limits.fast_s:.0f} ms)"
         low, high = self._contract.position_limits.T
         beyond = np.maximum(low - reading.positions, reading.positions - high)
@@ -108,8 +108,8 @@ class Watch:
 
 
 def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.ndarray, contract: Contract) -> np.ndarray:
-    """Return targets (D,) within the position limits for which |kp (target - q) - kd dq| is within the torque limits [rad].
-    Where both are not possible, the torque limits take precedence.
+    """Return the targets (D,) [rad] after clipping to the position limits, and then so that |kp (target - q) - kd dq| is
+    within the torque limits. Where both are not possible, the torque limits take precedence.
     """
     kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
     inside = np.clip(targets, *contract.position_limits.T)

@@ -1,8 +1,8 @@
-"""A robot reached by UDP, the simulator in another process or a bridge to a robot's computer, and the packets for it.
+"""A robot that is reached by UDP, and its packets. It is a simulator in another process, or a bridge to a real robot.
 
-A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program sends a greeting with the
-sources that it needs, and the robot answers with its facts, both as JSON. Then the robot sends states to the last sender of a
-greeting, and the program sends commands. Each side numbers its packets in increasing order.
+A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program begins the handshake
+with HELLO and the sources that it needs, and the robot answers with FACTS, both as JSON. Then the robot sends states to the
+last sender of a HELLO, and the program sends commands. Each side numbers its packets in increasing order.
 """
 
 import json
@@ -32,16 +32,16 @@ COMMAND_HEAD = struct.Struct("<IH")
 LARGEST = 60_000
 """Largest size of a packet [bytes]."""
 ANSWER_S = 10.0
-"""Time within which a robot must answer a greeting [s]."""
+"""Time within which a robot must answer a HELLO [s]."""
 ASK_EVERY_S = 0.1
 SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
-"""Linux's socket option for arrival times of packets, as `time.time`, and the name of that information."""
+"""Linux's socket option for arrival times of packets, on the clock of `time.time`, and the type of the message with them."""
 MOMENT = struct.Struct("@ll")
 """Seconds and microseconds."""
 SET_S = 0.01
-"""Smallest change of the difference between this machine's two clocks that counts as a reset of its time of day [s]."""
+"""Change of the difference between `perf_counter` and `time` above which the time of day counts as reset [s]."""
 SOURCE_AGE_S = 0.2
-"""Age at which the value of a source expires, by this machine's clock, since a robot may have none [s]."""
+"""Age at which the value of a source expires [s]. This machine's clock counts, because a robot may have none."""
 
 
 def packet(kind: int, sequence: int, body: bytes = b"") -> bytes:
@@ -58,16 +58,16 @@ def open_packet(data: bytes) -> tuple[int, int, bytes] | None:
 
 
 def pack_sources(sources: Mapping[str, np.ndarray | None]) -> bytes:
-    """Return the body of a greeting: source -> its points (P, 2), or None."""
+    """Return the body of a HELLO: source -> its points (P, 2), or None."""
     wanted = {name: None if points is None else points.tolist() for name, points in sources.items()}
     return json.dumps({"sources": wanted}).encode()
 
 
 def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
-    """Return the sources of a greeting.
+    """Return the sources of a HELLO.
 
     Raises:
-        ValueError, KeyError, TypeError, AttributeError: the body is no greeting, or has points that are not finite.
+        ValueError, KeyError, TypeError, AttributeError: the body is no HELLO, or has points that are not finite.
     """
     found: dict[str, np.ndarray | None] = {}
     for name, given in plain_json(body)["sources"].items():
@@ -79,14 +79,14 @@ def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
 
 
 def pack_facts(facts: RobotFacts) -> bytes:
-    """Return the body of the answer to a greeting; null stands for no limit."""
+    """Return the body of FACTS; null stands for no limit."""
     limits = [[x if np.isfinite(x) else None for x in pair] for pair in facts.position_limits.tolist()]
     said = {**vars(facts), "position_limits": limits, "offers": sorted(facts.offers)}
     return json.dumps(said, default=np.ndarray.tolist).encode()
 
 
 def unpack_facts(body: bytes) -> RobotFacts:
-    """Return the facts in the answer to a greeting.
+    """Return the facts in the body of FACTS.
 
     Raises:
         ValueError, KeyError, TypeError: the body has no facts.
@@ -139,7 +139,7 @@ def unpack_state(body: bytes, received: float) -> Reading:
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(str(error)) from error
     if place != len(body):
-        raise ValueError("its length is another")
+        raise ValueError("its length is wrong: it is too long")
     q, dq, torques = numbers[7:].reshape(3, count)
     return Reading(moment, received, numbers[:4], numbers[4:7], q, dq, torques, sources=found)
 
@@ -161,7 +161,7 @@ def unpack_command(body: bytes) -> tuple[int, np.ndarray]:
     answers, count = COMMAND_HEAD.unpack_from(body)
     numbers = np.frombuffer(body, "<f4", offset=COMMAND_HEAD.size).astype(float)
     if len(numbers) != 3 * count or not np.isfinite(numbers).all():
-        raise ValueError("its numbers are others")
+        raise ValueError("its numbers are too few, too many or not finite")
     return answers, numbers.reshape(3, count)
 
 
@@ -169,7 +169,7 @@ class UdpRobot(Interface):
     """A robot that answers with the packets of this module."""
 
     def __init__(self, address: str) -> None:
-        """Greet the robot at `address`, "host:port".
+        """Connect to the robot at `address`, "host:port", and receive its facts.
 
         Raises:
             ConfigError: the address is invalid.
@@ -200,7 +200,7 @@ class UdpRobot(Interface):
             self._send(self._greeting)
             time.sleep(ASK_EVERY_S)
             for _, body, _ in self._received(FACTS):
-                with suppress(ValueError, KeyError, TypeError):  # not from a robot
+                with suppress(ValueError, KeyError, TypeError):  # the packet may not come from a robot
                     return unpack_facts(body)
         self._socket.close()
         raise RunError(f"--robot: no robot answers at udp:{address} within {ANSWER_S:g} s")
@@ -250,7 +250,7 @@ class UdpRobot(Interface):
             fresh = {name: values for name, (at, values) in self._seen.items() if came - at <= SOURCE_AGE_S}
             found.append(replace(state, sources=fresh))
         if found and not self._asked <= found[-1].sources.keys():
-            self._send(self._greeting)  # the first greeting may be lost
+            self._send(self._greeting)  # the first HELLO may be lost
         return found
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:

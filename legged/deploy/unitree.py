@@ -72,7 +72,7 @@ NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0
 ENABLED = 1
 """Mode of a motor that is on."""
 SERIES = 0
-"""`mode_pr` with which the ankles and the waist of G1 take pitch and roll angles instead of those of their two motors."""
+"""`mode_pr` with which the ankles and the waist of G1 take pitch and roll angles instead of the angles of their motors."""
 OTHER_G1 = {1: "23 joints", 3: "a locked waist", 4: "23 joints", 6: "a locked waist", 9: "no legs"}
 """`mode_machine` of a G1 without all 29 joints -> its joints (from the table of Unitree's description of G1)."""
 BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
@@ -162,7 +162,7 @@ def crc(message: bytes) -> int:
 def command_of(
     kind: UnitreeKind, mode_machine: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return a command, a record (), with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Their
+    """Return a command, a record (), with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Target
     velocities and feedforward torques are zero, and all other motors are off. `mode_machine` is the value in G1's state.
     """
     message, places = np.zeros((), kind.command), list(kind.motors)
@@ -196,8 +196,8 @@ class SdkWire:
     """Transport of messages by Unitree's SDK (the extra `unitree-sdk2`)."""
 
     def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
-        """Join the network by the interface `network`, such as eth0. The DDS domain 0 is a robot's, `SIMULATOR_DOMAIN` that
-        of Unitree's simulator.
+        """Join the network through the interface `network`, such as eth0. The DDS `domain` is 0 for a robot, and
+        `SIMULATOR_DOMAIN` for Unitree's simulator.
 
         Raises:
             ConfigError: the SDK is not installed, or cannot join the network.
@@ -211,7 +211,7 @@ class SdkWire:
         except ImportError as error:
             raise ConfigError(
                 f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
-                " 'legged[unitree-sdk2]'; where that is done, install it from Unitree's own sources (unitree_sdk2_python)"
+                " 'legged[unitree-sdk2]'; if that does not help, install it from Unitree's own sources (unitree_sdk2_python)"
             ) from error
         try:
             channel.ChannelFactoryInitialize(domain, network)
@@ -247,8 +247,8 @@ class SdkWire:
             client.ReleaseMode()
             time.sleep(1.0)
         if not answered:
-            raise RunError("--robot: nobody says whether the robot's own controller is on; is --network the right one?")
-        raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; leave it by hand")
+            raise RunError("--robot: the robot does not say if its own controller is on; check --network")
+        raise RunError(f"--robot: the robot's own controller is still on after {RELEASE_S:g} s; switch it off by hand")
 
     def send(self, command: Any) -> None:
         """Send a LowCmd_.
@@ -256,7 +256,7 @@ class SdkWire:
         Raises:
             RunError: it was not sent.
         """
-        if self._publisher.Write(command) is False:  # the SDK does not raise
+        if self._publisher.Write(command) is False:  # the SDK returns False, it raises nothing
             raise RunError("--robot: Unitree's SDK could not send a command")
 
     def close(self) -> None:
@@ -272,7 +272,7 @@ class UnitreeRobot(Interface):
         """Wait for the first state of the robot `name`, a key of `KINDS`, and make it leave its own controller.
 
         Raises:
-            ConfigError: the robot has fewer joints.
+            ConfigError: the robot is a G1 without all 29 joints.
             RunError: the robot sends no state, or keeps its controller.
         """
         self.kind = KINDS[name]
@@ -287,7 +287,7 @@ class UnitreeRobot(Interface):
             wire.listen(self._hear)
             if not self._first.wait(FIRST_STATE_S):
                 raise RunError(
-                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; is it on, and --network the right one?"
+                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; check that it is on, and check --network"
                 )
             if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
                 raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")

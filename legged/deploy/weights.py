@@ -1,7 +1,7 @@
 """policy.weights: a network as plain numbers, for computers without onnxruntime; `cpp/legged_policy.hpp` reads it too.
 
-All little-endian. `MAGIC`, the number of layers (uint32), then layer by layer: kind, detail, inputs, outputs (uint32 each),
-and float32 numbers, matrices row by row:
+All numbers are little-endian. The file has `MAGIC`, the number of layers (uint32), and for each layer: kind, detail, inputs,
+outputs (uint32 each), and float32 numbers, matrices row by row:
 
 - `NORMALISE`: means and divisors (inputs each); x -> (x - mean) / divisor.
 - `LINEAR`: matrix (outputs, inputs) and bias (outputs).
@@ -9,8 +9,8 @@ and float32 numbers, matrices row by row:
 - `LSTM`: matrices (4 outputs, inputs) and (4 outputs, outputs) and two biases (4 outputs); gates i, f, g, o.
 - `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
 - `KEEP`: no numbers; passes its inputs on and keeps them for the next `JOIN`.
-- `JOIN`: no numbers; the outputs are the kept inputs followed by its own inputs. With these two a policy receives the outputs
-  of an estimator in addition to its observations.
+- `JOIN`: no numbers; the outputs are the kept inputs followed by its own inputs. With `KEEP` and `JOIN` a policy receives
+  the outputs of an estimator in addition to its observations.
 """
 
 import math
@@ -94,7 +94,7 @@ def unpack(data: bytes) -> list[Layer]:
     """Return the layers of a file.
 
     Raises:
-        ValueError: the data are no such file, too short, have numbers that are not finite, or do not form a network.
+        ValueError: the data are no such file, are too short, have numbers that are not finite, or do not form a network.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
@@ -117,10 +117,10 @@ def unpack(data: bytes) -> list[Layer]:
                 kept = inputs
             if kind == JOIN:
                 if not kept or outputs != kept + inputs:
-                    raise ValueError("has a layer that joins what was not kept")
+                    raise ValueError("has a layer JOIN without a layer KEEP that fits")
                 kept = 0
             if kind in (NORMALISE, ACTIVATION, KEEP) and inputs != outputs:
-                raise ValueError("has a layer that changes a width it cannot change")
+                raise ValueError("has a layer whose outputs must be as many as its inputs")
             if kind == ACTIVATION and detail >= len(ACTIVATIONS):
                 raise ValueError("has a layer that this program does not know")
             if layers and layers[-1].outputs != inputs:
@@ -129,17 +129,17 @@ def unpack(data: bytes) -> list[Layer]:
     except struct.error as error:
         raise ValueError("is cut short") from error
     if place != len(data):
-        raise ValueError("is longer than it says")
+        raise ValueError("is longer than its layers")
     if not layers:
         raise ValueError("has no layers")
     return layers
 
 
 class NumpyNetwork:
-    """The network of such a file in float64 for a batch of observations; it keeps the hidden state between calls."""
+    """The network of a policy.weights in float64 for a batch of observations. It keeps the hidden state between calls."""
 
     def __init__(self, data: bytes) -> None:
-        """Load the contents of a file. Raises the errors of `unpack`."""
+        """Load the contents of the file. Raises the errors of `unpack`."""
         self._layers = unpack(data)
         self._functions = list(ACTIVATIONS.values())
         self._hidden: dict[int, np.ndarray] = {}

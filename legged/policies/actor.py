@@ -42,11 +42,11 @@ class Actor:
         self.network.reset(hidden_state=kept if isinstance(hidden, tuple) else kept[0])
 
     def load(self, checkpoint: Path) -> int:
-        """Load the weights of a checkpoint, and the progress of its curricula into the task; return its number of training
-        iterations.
+        """Load the weights of a checkpoint, and continue its curricula in the task; return the number of training iterations
+        of the checkpoint.
 
         Raises:
-            ConfigError: the file is no checkpoint, or has another network.
+            ConfigError: the file is no checkpoint, or its network has other sizes.
         """
         saved = read_checkpoint(checkpoint)
         try:

@@ -146,7 +146,7 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:
     """Return one observation term, with the half width of its noise. The unit is that of the mark `@unit`; frame and formula
-    are words of the method's docstring.
+    come from the method's docstring.
     """
     method = getattr(type(task), f"_obs_{term.name}")
     text = " ".join((inspect.getdoc(method) or "").partition("\n\n")[0].split())
@@ -174,7 +174,7 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
 
 
 def describe_estimator(task: BaseTask) -> dict[str, Any]:
-    """Return the outputs of a policy's estimator as `estimator`; an empty dictionary without one."""
+    """Return the outputs of a policy's estimator under the key `estimator`; an empty dictionary if it has no estimator."""
     if ESTIMATED not in task.observation_groups:
         return {}
     targets = []

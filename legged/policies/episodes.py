@@ -18,8 +18,8 @@ Policy = Callable[[TensorDict], Tensor]
 
 
 def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, list[tuple[str, Any]]]:
-    """Return the policy without randomisation, and overrides for measuring a number of episodes, one per environment, without
-    noise. Metrics are logged once, at the end.
+    """Return the policy without randomisation, and overrides with which each of `episodes` environments runs one episode
+    without noise. Metrics are logged once, at the end.
     """
     cfg = policy.cfg
     calm = replace(policy, cfg=cfg.trained())
@@ -74,7 +74,7 @@ def measure_episodes(task: BaseTask, act: Policy, after_step: Callable[[int, flo
 
 
 def spread_of(values: list[float]) -> dict[str, float]:
-    """Return mean, standard deviation (of these values, not of a population they are drawn from), least and greatest."""
+    """Return mean, standard deviation (the squares are divided by N, not by N - 1), smallest and largest of N values."""
     numbers = torch.tensor(values, dtype=torch.float64)
     return {
         "mean": float(numbers.mean()),
@@ -85,7 +85,7 @@ def spread_of(values: list[float]) -> dict[str, float]:
 
 
 def episodes_table(episodes: dict[str, Any], title: str) -> Table:
-    """Return one line for each measure: return, its terms, lengths, failures, metrics."""
+    """Return a table with one row for each measure: return, its terms, lengths, failures, metrics."""
     rows = [
         [label, *(f"{episodes[name][key]:.1f}" for key in ("mean", "std", "min", "max"))]
         for name, label in (("return", "return"), ("length", "episode length [steps]"))

@@ -30,15 +30,15 @@ EXPORTED = "exported"
 """Folder of the exported files, inside that of a film or a checkpoint."""
 CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
-"""Steps and robots of the check of a recurrent policy."""
+"""Numbers of steps and robots with which the export of a recurrent policy is checked."""
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
-"""Steps and robots at which episodes begin during that check."""
+"""Pairs of step and robot at which an episode begins during that check."""
 LARGEST_DIFFERENCE = 1e-4
 """Largest allowed difference between an export and the policy, in actions or relative to the largest action."""
 
 
 class ExportError(RunError):
-    """An exported policy computes other actions than the policy."""
+    """Error that the actions of an exported file differ from the policy's."""
 
 
 def export(
@@ -58,7 +58,7 @@ def export(
     the configuration of the training if it is not the task's. A network of the motors is copied to the folder.
 
     Raises:
-        ExportError: a file computes other actions.
+        ExportError: the actions of a file differ from the policy's.
         RunError: a file cannot be written.
     """
     metadata = {**describe(task, trained), **(training or {})}
@@ -77,7 +77,7 @@ def export(
         groups = dict(zip(widths, step.split([*widths.values()], dim=1), strict=True))
         return policy(TensorDict(groups, batch_size=[len(step)]))
 
-    # Files are checked in memory before they are written; torch aborts the process when the disk is full.
+    # Files are made and checked in memory, because torch aborts the process if the disk is full.
     hidden = policy.get_hidden_state()
     try:
         policy.to("cpu").eval()
@@ -113,8 +113,8 @@ def export(
 def _actions(
     run: Callable[[Tensor], Any], restart: Callable[[Tensor], Any], observations: Tensor, begins: Tensor
 ) -> np.ndarray:
-    """Return the actions (T, batch, D) for observations (T, batch, width), step by step; `restart` gets the mask (batch,) of
-    the episodes that begin before a step, a row of `begins`.
+    """Return the actions (T, batch, D) for observations (T, batch, width), step by step. Before each
+    step `restart` gets a row of `begins`, the mask (batch,) of the episodes that begin with this step.
     """
     actions = []
     for step, new in zip(observations, begins, strict=True):
@@ -125,7 +125,7 @@ def _actions(
 
 @torch.inference_mode()
 def _by_script(content: bytes, observations: Tensor, begins: Tensor, batch: int) -> np.ndarray:
-    """Return the actions of the TorchScript file in batches of `batch` columns, each of which begins episodes at once."""
+    """Return the actions of the TorchScript file for batches of `batch` robots, whose episodes all begin at the same step."""
     script = torch.jit.load(io.BytesIO(content))
 
     def restart(new: Tensor) -> None:
@@ -140,7 +140,7 @@ def _by_script(content: bytes, observations: Tensor, begins: Tensor, batch: int)
 
 
 def _by_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[str, Any] | None) -> np.ndarray:
-    """Return the actions of the ONNX file, whose hidden state, described by `memory`, is passed on."""
+    """Return the actions of the ONNX file. The hidden state that `memory` describes is passed from step to step."""
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     hidden: dict[str, np.ndarray] = {}
     if memory is not None:
@@ -199,8 +199,8 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
 
 
 def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
-    """Return the file of `policy`, rsl-rl's actor network on the CPU, whose hidden layers have an activation of rsl-rl's
-    name. Only the outputs for the means of actions are kept.
+    """Return the file of weights of `policy`, rsl-rl's actor network on the CPU. `activation` is rsl-rl's name for the
+    activation of hidden layers. Of the outputs only the means of the actions are kept.
     """
     layers: list[Layer] = []
     if policy.obs_normalization:
@@ -218,7 +218,7 @@ def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
 
 
 def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> list[Layer]:
-    """Return the layers of an MLP; the last one is cut to its first `outputs`, which are the means."""
+    """Return the layers of an MLP; the last layer keeps only its first `outputs`, the means of the actions."""
     layers: list[Layer] = []
     linear = [module for module in mlp if isinstance(module, nn.Linear)]
     for module in linear:

@@ -44,7 +44,7 @@ JOINTS, STIFFNESS, DAMPING = (
     ("kp", "stiffness", "joint_stiffness"),
     ("kd", "damping", "joint_damping"),
 )
-"""Keys of an ONNX file's metadata for its joints in its order, and for their gains."""
+"""Keys of an ONNX file's metadata for its joints, in the order of the network, and for their P and D gains."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class Layout:
 
 
 def read_layout(name: str, where: str) -> Layout:
-    """Return the layout in the file `name`, or of that name under resources/layouts/; `where` begins the error about the
-    name. A file that ends in .json is the policy.json of an export.
+    """Return the layout in the file `name`, or the one with this name in resources/layouts/. An error about the name begins
+    with `where`. A file that ends in .json is the policy.json of an export.
 
     Raises:
         ConfigError: there is no such file, or it is no layout.
@@ -103,7 +103,7 @@ def read_layout(name: str, where: str) -> Layout:
     )
     if path is None:
         known = suggest(name, [file.stem for file in folder.glob("*.yaml")])
-        raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor here{known}")
+        raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor in this package{known}")
     if path.suffix == ".json":
         layout = _layout_of(read_contract(path))
     else:
@@ -121,13 +121,13 @@ def _layout_of(contract: Contract) -> Layout:
     """Return the layout of an exported policy, which must observe a single step, with one scale for each term."""
     path = contract.path
     if contract.states or any(group.history != 1 for group in contract.groups):
-        raise ConfigError(f"{path}: the policy has a memory; only policies that observe a single step can be played here")
+        raise ConfigError(f"{path}: the policy has a memory or a history; only policies without both can be played here")
     observation: dict[str, float] = {}
     for term in contract.terms:
         halves = dict(zip(COMMANDS, (term.scale[:2], term.scale[2:]), strict=True))
         for part, scales in halves.items() if term.name == "commands" else ((term.name, term.scale),):
             if (scales != scales[0]).any():
-                text = f"columns of '{term.name}' have scales of their own: {term.scale.tolist()}"
+                text = f"the columns of '{term.name}' have different scales: {term.scale.tolist()}"
                 raise ConfigError(f"{path}: observation: {text}")
             observation[part] = float(scales[0])
     joints = contract.joint_names
@@ -265,7 +265,7 @@ class ForeignPolicy:
         Args:
             command: vx, vy [m/s] and yaw rate [rad/s].
             lin_vel: velocity of the base's origin, base frame [m/s].
-            ang_vel: its angular velocity, base frame [rad/s].
+            ang_vel: angular velocity of the base, base frame [rad/s].
             gravity: unit vector along gravity, base frame.
             dof_pos: joint angles (D,) [rad].
             dof_vel: joint velocities (D,) [rad/s].

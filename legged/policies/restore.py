@@ -37,8 +37,8 @@ class TrainedPolicy:
 
 
 def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLICY") -> TrainedPolicy:
-    """Return the policy that a user names: by a task, whose newest run or else shipped policy it is; by the task's YAML file;
-    by a run, `<experiment>/<run>` below logs/; or by a folder. `checkpoint` is an iteration, 'best' or None for the latest;
+    """Return the policy that a user names. The name is a task or its YAML file (for the newest run, else the shipped policy),
+    a run `<experiment>/<run>` below logs/, or a folder. `checkpoint` is an iteration, 'best' or None for the latest;
     `where` is the argument that gave the name.
 
     Raises:
@@ -46,10 +46,10 @@ def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLI
     """
     folder = run_named(name, where)
     cfg = run_config(folder, where)
-    if cfg.task not in task_names():  # a run says neither where the file of its task lies nor which class it has
+    if cfg.task not in task_names():  # a run stores neither the file nor the class of its task
         raise ConfigError(
-            f"{where}: {relative(folder)} was trained on a user-defined task, '{cfg.task}': --import FILE says where it is"
-            " defined"
+            f"{where}: {relative(folder)} was trained on a user-defined task, '{cfg.task}'; name the file that defines it"
+            " with --import FILE"
         )
     return TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
 
@@ -73,7 +73,7 @@ def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
     Raises:
         ConfigError: the changes do not fit the configuration.
     """
-    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # nothing is trained
+    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # without training, robots need not fill mini-batches
     cfg = override(cfg.trained(), [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     return cfg
@@ -87,8 +87,8 @@ def restore(
     terrain: Terrain | None = None,
     make: Callable[..., Any] = make_task,
 ) -> tuple[Any, Actor]:
-    """Return the policy's task with changed settings, on its own terrain or the given one, and the policy. Writes no files.
-    `make` builds a task from a configuration, as `make_task` does.
+    """Build the policy's task with `changes`, on the task's own terrain or the given one; return the task and the policy. No
+    file is written. `make` builds a task from a configuration, as `make_task` does.
 
     Raises:
         ConfigError: the checkpoint does not fit the task.

@@ -57,7 +57,7 @@ class Once(argparse.Action):
         """Store the value, or end the program if there is one already."""
         before = getattr(namespace, self.dest)
         if before is not None:
-            parser.error(f"{option}: is given twice, {before} and {values}; let one of them import the other")
+            parser.error(f"{option}: is given twice, {before} and {values}; write {option} {before},{values}")
         setattr(namespace, self.dest, values)
 
 
@@ -73,10 +73,10 @@ IMPORT = argument(
 
 
 def check_number(flag: str, value: float | None, least: float, most: float = math.inf, above: bool = False) -> None:
-    """Check that a number of the command line, if it is given, is from `least`, or `above` it, to `most`.
+    """Check that a number of the command line, if it is given, is from `least` to `most`. `above` excludes `least` itself.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: the number is outside this range.
     """
     if value is None or (least < value <= most) or (value == least and not above):
         return
@@ -88,7 +88,7 @@ def check_between(flag: str, value: float | None, least: float, most: float, uni
     """Check that a number of the command line, if it is given, is from `least` to `most`, both in `unit`.
 
     Raises:
-        ConfigError: it is not.
+        ConfigError: the number is outside this range.
     """
     if value is not None and not least <= value <= most:
         raise ConfigError(f"{flag}: must be between {least:g} and {most:g}{unit and ' '}{unit}, got {value:g}")

@@ -9,15 +9,15 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 
 def available_cores() -> int:
-    """Return the number of cores that this process may use: those it may run on, limited by its group's share of CPU time."""
+    """Return the number of cores that this process may use: those in its affinity mask, limited by its cgroup's CPU quota."""
     allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = quota(CGROUPS, Path("/proc/self/cgroup"))
     return max(1, math.ceil(min(allowed, share)))
 
 
 def quota(root: Path, membership: Path) -> float:
-    """Return the smallest CPU share of this process's groups, in cores; infinite without a limit. The file `membership` lists
-    the groups, whose folders are below `root`.
+    """Return the smallest CPU quota of this process's cgroups, in cores; infinite if none has a quota. The file `membership`
+    lists the cgroups, and their folders are below `root`.
     """
     try:
         groups = [line.split(":", 2) for line in membership.read_text().splitlines()]
@@ -33,7 +33,7 @@ def quota(root: Path, membership: Path) -> float:
 
 
 def _share(folder: Path) -> float:
-    """Return the CPU share of one group, in cores: cpu.max of cgroup v2, cpu.cfs_* of v1."""
+    """Return the CPU quota of one cgroup, in cores, from its file cpu.max (v2) or its files cpu.cfs_* (v1)."""
     try:
         if (folder / "cpu.max").is_file():
             most, period = (folder / "cpu.max").read_text().split()

@@ -1,9 +1,10 @@
 """Deferred import of torch's compiler, until a function is compiled.
 
-`torch._dynamo` and its imports (sympy, torch._inductor, parts of torch.distributed) are a third of all modules of a training
-and a third of its start-up time, and nothing here compiles. But other modules import it in passing: tensordict marks some of
-its functions for it, and torch's optimisers and dispatch modes switch it off around themselves. A stand-in module records
-these marks. At the first use of another member it imports the real module and passes the marks on.
+`torch._dynamo` and its imports (sympy, torch._inductor, parts of torch.distributed) are a third of the modules that a
+training imports and a third of its start-up time, although this package compiles nothing. Other libraries import the compiler
+nevertheless: tensordict marks some of its functions for it, and torch's optimisers and dispatch modes exclude their own code
+from it. A stand-in module records these marks. The first use of any other attribute imports the real module and passes the
+marks on.
 """
 
 import importlib
@@ -26,7 +27,7 @@ usual.
 
 
 class DeferredCompiler(ModuleType):
-    """Stand-in for `torch._dynamo` with the four functions that are called by code that does not compile. Any other
+    """Stand-in for `torch._dynamo` with the four functions that libraries call even if nothing is compiled. Any other
     attribute, and any submodule, comes from the real module.
     """
 
@@ -34,7 +35,7 @@ class DeferredCompiler(ModuleType):
         """Create the stand-in for the package in `folder`."""
         super().__init__(NAME, "A stand-in for torch's compiler.")
         spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py", submodule_search_locations=[str(folder)])
-        # Code that reads an attribute of all modules, such as the file, must not cause the import.
+        # Some code reads attributes such as `__file__` of every module. That must not import the compiler.
         self.__spec__, self.__file__, self.__path__ = spec, str(folder / "__init__.py"), [str(folder)]
         self.__package__ = NAME
         self._marks: list[tuple[str, Any]] = []
@@ -50,8 +51,8 @@ class DeferredCompiler(ModuleType):
         return function
 
     def disable(self, function: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Return the function unchanged to torch's own wrapper, which asks at its first call and keeps the result. For any
-        other caller the real module answers.
+        """Return the function unchanged if torch's own wrapper calls, which does so once and keeps the result. Pass any other
+        call on to the real module.
         """
         if self.stands and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
             self._not_disabled.append(function)
@@ -59,7 +60,7 @@ class DeferredCompiler(ModuleType):
         return self.real().disable(function, *args, **kwargs)
 
     def graph_break(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing, as the real function outside of compiled code."""
+        """Do nothing, because outside of compiled code the real function does nothing either."""
         if not self.stands:
             self.real().graph_break(*args, **kwargs)
 
@@ -77,7 +78,7 @@ class DeferredCompiler(ModuleType):
         for name, function in self._marks:
             getattr(real, name)(function)
         for function in self._not_disabled:
-            vars(function).pop("__dynamo_disable", None)  # torch's wrapper will ask again
+            vars(function).pop("__dynamo_disable", None)  # torch's wrapper then asks the real module
         return real
 
     @property
@@ -87,8 +88,8 @@ class DeferredCompiler(ModuleType):
 
 
 class _Submodules:
-    """Finder and loader of the compiler's submodules, which imports the compiler first, since that imports most of them. The
-    loader gives Python the already imported module in place of a second copy.
+    """Finder and loader of the compiler's submodules. It first imports the compiler, which imports most of its submodules
+    itself. Python then gets the module that is already imported, not a second copy.
     """
 
     def __init__(self, stand_in: DeferredCompiler) -> None:
@@ -119,7 +120,7 @@ def defer_compiler() -> None:
     torch = importlib.util.find_spec("torch") if "torch" not in sys.modules else None
     if torch is None or torch.origin is None or NAME in sys.modules:
         return
-    with suppress(importlib.metadata.PackageNotFoundError):  # a torch that does not state its version
+    with suppress(importlib.metadata.PackageNotFoundError):  # torch may not state its version
         if importlib.metadata.version("torch").startswith(KNOWN):
             stand_in = DeferredCompiler(Path(torch.origin).parent / "_dynamo")
             sys.modules[NAME] = stand_in

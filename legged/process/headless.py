@@ -1,5 +1,5 @@
-"""Choice of MuJoCo's library for drawing on a Linux machine without a display; imported before MuJoCo, which reads it at
-import.
+"""Choice of the library with which MuJoCo draws on a Linux machine without a display. This module is imported before MuJoCo,
+which reads MUJOCO_GL at import.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ ANSWER_S = 0.5
 """Time after which a display that does not answer counts as missing [s]."""
 OFF = ("disable", "disabled", "off", "false", "0")
 ALLOWED = ("egl", "osmesa", "glfw", "glx") if sys.platform == "linux" else ("cgl", "glfw", "wgl")
-"""Values of MUJOCO_GL; `OFF` and words for on are allowed too."""
+"""Values of MUJOCO_GL; `OFF` and `ON` are allowed too."""
 CONTEXT = "mujoco.rendering.classic.gl_context"
 """MuJoCo's module that imports the library for drawing."""
 ON = ("", "enable", "enabled", "on", "true", "1")
@@ -33,7 +33,7 @@ def display_answers() -> bool:
     wayland = os.environ.get("WAYLAND_DISPLAY")
     if wayland and _connects(os.path.join(os.environ.get("XDG_RUNTIME_DIR", ""), wayland)):
         return True
-    # host:number.screen; no host or 'unix' is this machine
+    # DISPLAY has the form host:number.screen. An empty host and 'unix' mean this machine.
     match = re.fullmatch(r"(?:[a-z]+/)?(.*):(\d+)(?:\.\d+)?", os.environ.get("DISPLAY", ""))
     if match is None:
         return False
@@ -72,8 +72,9 @@ def off_screen_library() -> str | None:
 
 
 def choose() -> None:
-    """Set MUJOCO_GL on a machine without a display, unless the user has set it; check the user's value. MuJoCo cannot be
-    imported with a missing library. Then pictures are switched off with a warning, because most commands draw nothing.
+    """Set MUJOCO_GL on a machine without a display, unless the user has set it; check the user's value. If the user's
+    library is missing, MuJoCo could not be imported. So pictures are switched off with a warning, because most commands
+    draw nothing.
 
     Raises:
         ConfigError: MuJoCo does not know the value of MUJOCO_GL.
@@ -90,12 +91,12 @@ def choose() -> None:
     try:
         context = import_module(CONTEXT)
         if value not in OFF and context.GLContext.__module__ == CONTEXT:
-            context.GLContext()  # MuJoCo's placeholder for a missing library raises an error that names it
+            context.GLContext()  # MuJoCo's placeholder for a missing library raises an error with its name
     except Exception as error:  # each library fails in its own way
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
-            return  # a robot's computer, which draws nothing
+            return  # a robot's computer needs no MuJoCo, because it draws nothing
         works = off_screen_library()
-        instead = f"{works} may" if works and works != value else "no other library for drawing was found"
+        instead = f"{works} may work" if works and works != value else "no other library for drawing was found"
         why = " ".join(str(error).split())
         NO_PICTURES = f"MUJOCO_GL: '{given}' does not work on this machine ({why}); {instead}"
         os.environ["MUJOCO_GL"] = OFF[0]

@@ -1,5 +1,5 @@
-"""Counting of trainings that share a device: each holds a file lock that the others see, so that its report can state their
-number.
+"""Count of the trainings that share a device, for the report of each. Every training holds a file lock, which the others
+see.
 """
 
 import contextlib
@@ -15,21 +15,21 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts; otherwise its attempts on the locks would look like trainings."""
+"""File that a process locks while it counts. The locks that it tries would otherwise look like trainings."""
 PAUSE_S = 1.0
-"""Least interval between two counts during a training [s]."""
+"""Shortest time between two counts during a training [s]."""
 
 
 class Neighbours:
-    """The other trainings on one device, of any user and however started; a context in which this training is one of them.
+    """The other trainings on one device, of all users. In its context the others can see this training.
 
-    A lock ends with the process that holds it, however that ends. Trainings of another machine, or of a container with
-    separate temporary files, are not seen.
+    The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a
+    container with separate temporary files, are not seen.
     """
 
     def __init__(self, device: str) -> None:
-        """Take the unique name of the `device` on this machine, such as a GPU's UUID. It does not depend on the numbers that
-        processes give to devices.
+        """Take the unique name of the `device` on this machine, such as a GPU's UUID. An index would not
+        do, because processes may number the devices differently.
         """
         self.most = 0
         """Largest number of other trainings seen at one time."""

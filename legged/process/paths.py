@@ -1,5 +1,5 @@
-"""Paths of the data folders, which are at the top of a clone or inside an installed package; and functions that write files
-atomically and check in advance if they can be written.
+"""Paths of the data folders, which are at the top of a clone or inside an installed package. Functions that write files
+atomically, and that check in advance if a folder can be written.
 """
 
 import errno
@@ -38,7 +38,7 @@ def data_folder(name: str) -> Path:
 
 
 def relative(path: Path) -> str:
-    """Return `path` in its shortest form, relative to the working directory if it is below it."""
+    """Return `path` relative to the working directory if it is inside that directory, else unchanged."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except (OSError, ValueError):
@@ -59,8 +59,8 @@ def reason(error: OSError) -> str:
 
 
 def full_disk_in(error: BaseException) -> OSError | None:
-    """Return the error of a full disk in the chain of causes of `error`, or None. A library may hide it behind its own
-    error.
+    """Return the error of a full disk in the chain of causes of `error`, or None. A library may have raised
+    another error because of it.
     """
     found: BaseException | None = error
     while found is not None:
@@ -76,7 +76,7 @@ def replacing(path: Path) -> Iterator[Path]:
     the block, or is removed if the block fails.
 
     Raises:
-        RunError: it can't be written: the disk is full or read-only, or belongs to another user.
+        RunError: the file can't be written: the disk is full or read-only, or the folder belongs to another user.
     """
     part = path.with_name(f".{path.stem}.{os.getpid()}-{next(_COUNTER)}{path.suffix}")
     try:
@@ -114,8 +114,8 @@ def make_folder(folder: Path) -> None:
     """Make a folder and its missing parents.
 
     Raises:
-        ConfigError: a file is in its place, or its name is not a valid folder name.
-        RunError: it can't be made: the disk is full or read-only, or belongs to another user.
+        ConfigError: a file has this path or a parent's, or the name is not a valid folder name.
+        RunError: the folder can't be made: the disk is full or read-only, or the parent belongs to another user.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -139,12 +139,12 @@ def not_made(folder: Path, error: OSError | ValueError) -> ConfigError | RunErro
 
 
 def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
-    """Check, before long work, that its results can be written: that `folder` exists or can be made, that it is writable, and
+    """Check before long work that its results can be written: that `folder` exists or can be made, that it is writable, and
     that its disk has `megabytes` free. Nothing is left behind.
 
     Raises:
-        ConfigError: a file is in its place, or its name is not a valid folder name.
-        RunError: it can't be written: the disk is full or read-only, or belongs to another user.
+        ConfigError: a file has this path or a parent's, or the name is not a valid folder name.
+        RunError: the folder can't be written: the disk is full or read-only, or the folder belongs to another user.
     """
     if any("\0" in part or len(os.fsencode(part)) > LONGEST_NAME for part in folder.parts):
         raise not_made(folder, OSError(errno.ENAMETOOLONG, "no folder can have such a name"))
@@ -155,6 +155,6 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
         with tempfile.TemporaryFile(dir=here, buffering=0) as probe:
             if shutil.disk_usage(here).free < megabytes * 2**20:
                 raise OSError(errno.ENOSPC, DISK_FULL)
-            probe.write(bytes(2**16))  # a quota takes effect only here
+            probe.write(bytes(2**16))  # a disk quota refuses only an actual write
     except OSError as error:
         raise RunError(f"{relative(folder)}: cannot write there: {reason(error)}") from error

@@ -1,4 +1,4 @@
-"""Child processes: their environment, and a pool that runs them side by side with a limit for each kind of work."""
+"""Child processes: their environment, and a pool that runs them in parallel with a limit for each kind of work."""
 
 import os
 import signal
@@ -23,8 +23,8 @@ BUILT = "step captured"
 
 
 def child_environment() -> dict[str, str]:
-    """Return an environment in which a child Python finds this package where this process did. The child's start-up stages
-    are not reported as this one's.
+    """Return the environment for a child process in Python, which then imports this copy of the package. The child does not
+    report its start-up stages to the file of this process.
     """
     environment = {name: value for name, value in os.environ.items() if name != STAGES_FILE}
     top = Path(__file__).resolve().parents[2]
@@ -57,7 +57,7 @@ class Job:
 
     @property
     def stages(self) -> Path:
-        """File that lists the finished stages of its start-up."""
+        """File that lists the finished stages of the process's start-up."""
         return self.output.with_suffix(".stages")
 
     @property
@@ -144,7 +144,7 @@ class WorkerPool:
 
 
 def why_failed(job: Job, code: int) -> str:
-    """Return one line on why a job failed: its own error message, else its signal or exit code."""
+    """Return one line on why a job failed: its error message, the signal that killed it, its last output or its exit code."""
     text = job.output.read_text(encoding="utf-8", errors="replace") if job.output.is_file() else ""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     errors = [line for line in lines if line.startswith("error: ")]

@@ -8,12 +8,12 @@ from legged.errors import ConfigError
 
 @dataclass(frozen=True)
 class Ranks:
-    """Rank of this process among those that train together, one for each GPU."""
+    """Rank of this process among the processes that train together, one process for each GPU."""
 
     rank: int = 0
     """Number of this process. Process 0 logs, prints and saves."""
     local_rank: int = 0
-    """Number of this process on its machine, and of its GPU."""
+    """Number of this process on its machine, which is also the number of its GPU."""
     count: int = 1
     """Number of processes."""
     local_count: int = 1
@@ -21,7 +21,7 @@ class Ranks:
 
     @classmethod
     def now(cls) -> "Ranks":
-        """Return the ranks in the environment; a single process without them.
+        """Return the ranks in the environment, or those of a single process if the environment has none.
 
         Raises:
             ConfigError: the environment has impossible values.

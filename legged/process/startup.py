@@ -1,4 +1,4 @@
-"""Start of a process, imported before any large package, because imports take most of the start."""
+"""Set-up at the start of a process. It is imported before any large package, because imports take most of the start."""
 
 import atexit
 import gc
@@ -19,9 +19,8 @@ STARTED_S = time.perf_counter()
 INTERRUPTED = 128 + signal.SIGINT
 """Exit code of a command that Ctrl-C ended."""
 
-# A waiting thread of torch spins by default. If anything else runs on the machine, it then takes the core from the very
-# thread for which it waits, and updates take ten to a hundred times as long. torch reads this variable once, when it is first
-# imported.
+# A waiting thread of torch spins by default. On a busy machine a spinning thread takes the core from the thread for which it
+# waits, and updates take ten to a hundred times as long. torch reads this variable once, when it is first imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # rsl-rl imports GitPython, which prints a long warning where git is missing. This package calls git itself.
@@ -29,7 +28,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
 STAGES_FILE = "LEGGED_STAGES"
-"""Environment variable with the file in which each finished stage of a start is reported, for `legged benchmark startup`."""
+"""Environment variable that names the file to which each finished stage of a start is written, e.g. for benchmarks."""
 
 
 def stage_ended(name: str) -> None:
@@ -41,8 +40,8 @@ def stage_ended(name: str) -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Switch off garbage collection in the block, for imports or for objects that stay as long as imports do. They make a
-    million objects, and repeated passes over these take a quarter of a start.
+    """Switch off garbage collection in the block, which imports modules or makes other objects that stay until the process
+    ends. Imports make a million objects, and repeated passes over these objects take a quarter of a start.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -117,7 +116,7 @@ def leave_at_once(_number: int, _frame: FrameType | None) -> None:
 
 
 def leave_at_interrupts() -> None:
-    """Let Ctrl-C end the process at once, without a traceback. A handler of other code stays."""
+    """Let Ctrl-C end the process at once, without a traceback. A handler that other code has set stays."""
     if in_main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, leave_at_once)
 
@@ -131,4 +130,4 @@ def raise_at_interrupts() -> None:
 if command_of_ours():
     leave_at_interrupts()
     defer_compiler()
-    gc.disable()  # until `is_a_command`
+    gc.disable()  # `is_a_command` switches it on again

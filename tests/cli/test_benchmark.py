@@ -140,7 +140,10 @@ def test_students_and_estimators_are_timed_as_they_are_trained():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["anymal_c", "sim.physics=mujoco"], "error: command line: sim.physics: colliders of mujoco_warp"),
+        (
+            ["anymal_c", "sim.physics=mujoco"],
+            "error: command line: sim.physics: this command compares colliders of mujoco_warp",
+        ),
         (["anymal_c_flat", "sim.physics=mujoco_warp"], "error: TASK: 'anymal_c_flat' has no terrain"),
     ],
 )

@@ -271,7 +271,7 @@ def test_a_task_on_rough_ground_is_called_like_its_robot(added):
 def test_nothing_is_written_over_unless_asked(added, capsys):
     added(urdf(), "--name", "ninth_toy")
     assert call(add.main, ["toy.urdf", "--name", "ninth_toy", "--out", "mine"]) == 2
-    assert "there is mine/ninth_toy already; another name, or --force" in capsys.readouterr().err
+    assert "mine/ninth_toy exists already; give another name, or --force" in capsys.readouterr().err
     assert "ninth_toy" in added(urdf(), "--name", "ninth_toy", "--force")
 
 
@@ -287,9 +287,9 @@ def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force
     (tmp_path / "go/meshes/cube.obj").write_text(cube)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     assert call(add.main, ["go/go.xml", "--out", ".", *force]) == 2
-    assert "go/go.xml: lies in go, the folder that the robot goes to; another --name or --out" in capsys.readouterr().err
+    assert "go/go.xml: is in go, which would be written over; give another --name or --out" in capsys.readouterr().err
     assert call(add.main, ["go.urdf", "--out", ".", *force]) == 2
-    message = "go/meshes/cube.obj: lies in go, the" if force else "there is go already"
+    message = "go/meshes/cube.obj: is in go, which" if force else "go exists already"
     assert message in capsys.readouterr().err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 

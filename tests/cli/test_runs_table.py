@@ -278,7 +278,7 @@ def test_a_run_is_compared_with_others_only(capsys):
     folder = write_run(STAMPS[0])
     for same in (str(folder), f"{TASK}/{folder.name}", TASK):
         assert call(compare.main, [str(folder), same]) == 2
-        assert "RUN: a run comes twice" in capsys.readouterr().err
+        assert "RUN: a run is given twice" in capsys.readouterr().err
     assert call(compare.main, [str(folder), f"{TASK}/{folder.name}x"]) == 2
     assert f"did you mean '{TASK}/{folder.name}'" in capsys.readouterr().err
 

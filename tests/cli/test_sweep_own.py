@@ -57,7 +57,7 @@ def test_what_is_found_stands_beside_the_own_settings(capsys):
     plan = plan_of(AMONG)
     assert call(sweep.main, FLAGS) == 0
     out = capsys.readouterr().out
-    assert "not among those tried" not in out
+    assert "the sweep excludes" not in out
     all_trials = Trials(plan).all
     assert [plan.settings(trial.params) == plan.own for trial in all_trials] == [True, False, False]
     rank = ranking(plan, all_trials).index(all_trials[0]) + 1
@@ -76,7 +76,7 @@ def test_own_settings_that_are_not_among_those_tried_are_told(capsys):
     )
     assert call(sweep.main, FLAGS) == 0
     gamma = plan.own["train.algorithm.gamma"]
-    said = f"of which these are not among those tried: train.algorithm.gamma {gamma}, train.policy.activation 'elu'\n"
+    said = f"because the sweep excludes these values: train.algorithm.gamma {gamma}, train.policy.activation 'elu'\n"
     assert said in capsys.readouterr().out
     assert all(plan.settings(trial.params)["train.algorithm.gamma"] <= 0.6 for trial in Trials(plan).all)
     assert "own settings" not in (plan.folder / "table.md").read_text()

@@ -122,7 +122,7 @@ def test_gains_are_those_that_nothing_was_drawn_for():
 def test_a_task_without_a_robot_folder():
     lines = summary(task_config("humanoid", on_cpu=True))
     assert rows(lines, "actions: 17 numbers, clipped at +-1")[5] == ["5", "right_hip_y", "right_hip_y: 120 a [N m]"]
-    assert rows(lines, "rewards, a control step")[0] == ["linvel", "2.5", "Forward velocity of the centre of mass [m/s]"]
+    assert rows(lines, "rewards, per control step")[0] == ["linvel", "2.5", "Forward velocity of the centre of mass [m/s]"]
     assert rows(lines, "terminations")[0][:2] == ["unhealthy", "failure"]
     assert [row[0] for row in rows(lines, "observations 'actor': 276 numbers")] == [
         "0:22",

@@ -409,5 +409,5 @@ def test_a_mistake_in_a_user_s_class_is_one_line_with_file_and_line(capsys, tmp_
 
 
 def test_a_second_import_does_not_take_the_place_of_the_first(fails):
-    words = ("--import: is given twice, slip.py and feel.py", "let one of them import the other")
+    words = ("--import: is given twice, slip.py and feel.py", "write --import slip.py,feel.py")
     fails(train.main, [TASK, "--import", "slip.py", "--import", "feel.py"], *words)

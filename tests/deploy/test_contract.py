@@ -89,16 +89,16 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ({"stiffness": [1.0]}, r"is no policy\.json of an export \(ValueError: stiffness: 12 numbers are wanted"),
         ({"damping": ["much"] * 12}, r"is no policy\.json of an export \(ValueError"),
         ({"imu_frame": None}, r"is no policy\.json of an export \(KeyError: 'imu_frame'\)"),
-        ({"damping": [4.0] * 11 + [0.0]}, r"damping: must be above 0: it is what stops a robot, got 0"),
+        ({"damping": [4.0] * 11 + [0.0]}, r"damping: must be above 0, because damping stops the robot, got 0"),
         ({"stiffness": [-1.0] + [90.0] * 11}, r"stiffness: must be 0 or more, got -1"),
         ({"sim_dt": -0.005}, r"sim_dt: must be above 0, and at most control_dt, got -0\.005"),
         ({"action_scale": float("nan")}, r"action_scale: must be finite, got nan"),
         ({"action_clip": float("inf")}, r"action_clip: must be above 0 and finite, got inf"),
         ({"torque_limits": [0.0] * 12}, r"torque_limits: must be above 0, got 0"),
-        ({"position_limits": [[1.0, -1.0]] * 12}, r"position_limits: must be below the upper ones, got 1"),
+        ({"position_limits": [[1.0, -1.0]] * 12}, r"position_limits: must be below the upper limits, got 1"),
         (
             {"command_ranges": {"vx": [1.0, -1.0], "vy": [0.0, 0.0], "yaw_rate": [0.0, 0.0]}},
-            r"command_ranges: must be finite, and not above the upper ones, got 1",
+            r"command_ranges: must be finite, and not above the upper limits, got 1",
         ),
         (
             {"observation_groups": [{"name": "actor", "start": 0, "size": 45, "history": 0}]},
@@ -113,7 +113,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ),
         (
             {"observation_groups": [{"name": "other", "start": 0, "size": 45, "history": 2}]},
-            r"observation: 'base_ang_vel' lies outside its group 'actor'",
+            r"observation: the group 'actor' of 'base_ang_vel' does not exist",
         ),
     ],
 )
@@ -125,8 +125,8 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"name": "my_gyro"}, "'my_gyro' needs 'gyro', which it is not made of"),
-        ({"needs": "quaternion"}, "'base_ang_vel' needs 'quaternion', which"),
+        ({"name": "my_gyro"}, "'my_gyro' cannot be made from 'gyro'"),
+        ({"needs": "quaternion"}, "'base_ang_vel' cannot be made from 'quaternion'"),
         ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, a robot gives 3"),
         ({"start": 3}, "'base_ang_vel' must start at column 0, got 3"),
     ],
@@ -154,8 +154,11 @@ def other_order(names):
     ("changes", "says"),
     [
         ({"joint_names": lambda names: ("HIP", *names[1:])}, "joint_names: 'still' has no joint 'LF_HAA'"),
-        ({"joint_names": lambda names: (*names, "TAIL")}, "joint_names: the policy knows no joint 'TAIL', which 'still' has"),
-        ({"joint_names": other_order}, "joint 0 is 'LF_HAA' for the policy and 'LF_HFE' for 'still': another order"),
+        (
+            {"joint_names": lambda names: (*names, "TAIL")},
+            "joint_names: 'still' has a joint 'TAIL' that the policy does not know",
+        ),
+        ({"joint_names": other_order}, "joint 0 is 'LF_HAA' for the policy and 'LF_HFE' for 'still'; their orders differ"),
         ({"torque_limits": lambda limits: limits * 0.9}, "trained with 80 N m at 'LF_HAA', 'still' has 72"),
         ({"velocity_limits": lambda limits: limits - 1.0}, "trained with 20 rad/s at 'LF_HAA', 'still' has 19"),
         ({"torque_limits": lambda limits: limits * np.nan}, "trained with 80 N m at 'LF_HAA', 'still' has nan"),
@@ -179,7 +182,7 @@ def test_a_stronger_robot_fits(contract):
 @pytest.mark.slow
 def test_a_policy_that_needs_more_than_sensors_is_refused_by_the_name_of_the_observation(tmp_path):
     policy = Policy(exported(tmp_path, ("observations.actor", ["base_lin_vel", *PROPRIOCEPTION])))
-    with pytest.raises(ConfigError, match=r"observation: 'still' has nothing that gives 'base_lin_vel', which no sensor"):
+    with pytest.raises(ConfigError, match=r"observation: no sensor measures 'base_lin_vel', and 'still' has no source"):
         policy.contract.check_fits(facts_for(policy.contract))
     policy.contract.check_fits(facts_for(policy.contract, offers=frozenset({"base_lin_vel", "heights"})))
 
@@ -188,7 +191,9 @@ def test_files_of_two_exports_are_refused(folder, tmp_path):
     (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
     for key, value in (("action_scale", 0.25), ("stiffness", [90.5] * 12), ("damping", [3.0] * 12), ("control_dt", 0.01)):
         changed(folder, tmp_path, **{key: value})
-        with pytest.raises(ConfigError, match=rf"{key}: is not that of .*policy\.onnx: they are of different exports"):
+        with pytest.raises(
+            ConfigError, match=rf"{key}: differs from that of .*policy\.onnx; the files are of different exports"
+        ):
             Policy(tmp_path)
 
 
@@ -236,7 +241,7 @@ def export_of(folder, tmp_path):
 def test_every_entry_is_compared_with_the_onnx_file(export_of, changes):
     (key,) = changes
     with pytest.raises(
-        ConfigError, match=rf"policy\.json: {key}: is not that of .*policy\.onnx: they are of different exports"
+        ConfigError, match=rf"policy\.json: {key}: differs from that of .*policy\.onnx; the files are of different exports"
     ):
         Policy(export_of(sha256=None, **changes))
 

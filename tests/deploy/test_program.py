@@ -53,7 +53,7 @@ def test_a_robot_that_has_walked_stands_without_a_crouch(stage):
     at = {round(moment - 100.0, 2): asked for moment, *asked in stage.robot.written}
     np.testing.assert_allclose(at[5.14][0], 0.55 * at[4.98][0] + 0.45 * contract.default, atol=1e-3)
     np.testing.assert_allclose(at[5.3][0], contract.default, atol=1e-9)
-    assert stage.program.log.notes[-3:-1] == ["refused: walk: it stands up for 0.3 s first", "stand -> walk"]
+    assert stage.program.log.notes[-3:-1] == ["refused: walk: the robot first stands up, for 0.3 s", "stand -> walk"]
 
 
 def test_a_robot_in_its_default_pose_need_not_stand_up(stage):
@@ -65,7 +65,7 @@ def test_a_robot_in_its_default_pose_need_not_stand_up(stage):
     way = np.array([asked[round(moment, 2)][0] - contract.default for moment in np.arange(0.1, 0.43, 0.02)])
     assert (np.abs(way) <= 0.04 + 1e-9).all()
     np.testing.assert_allclose(asked[0.4][0], contract.default, atol=1e-9)
-    said = ["damping -> stand", "refused: walk: it stands up for 0.3 s first", "stand -> walk"]
+    said = ["damping -> stand", "refused: walk: the robot first stands up, for 0.3 s", "stand -> walk"]
     assert stage.program.log.notes[1:4] == said
 
 
@@ -74,7 +74,7 @@ def test_it_does_not_walk_when_it_does_not_stand(stage):
     stage.run({**WALKS, 4.0: QUIT})
     wanted = stage.policy.contract.default[1]
     assert stage.program.log.notes[2] == (
-        f"refused: walk: it does not stand: LF_HFE is {1.1 - wanted:.2f} rad from its default angle (allowed: 0.6)"
+        f"refused: walk: the robot does not stand: LF_HFE is {1.1 - wanted:.2f} rad from its default (allowed: 0.6)"
     )
 
 
@@ -96,13 +96,18 @@ def test_one_that_walks_halts_before_it_stands(stage):
     times, commands, states = (np.array(cycles[name]) for name in ("times", "command", "state"))
     np.testing.assert_allclose(commands[np.searchsorted(times, [4.99, 5.25, 5.55]), 0], [0.5, 0.25, 0.0], atol=0.03)
     assert times[np.flatnonzero(states == 3)[-1]] == pytest.approx(6.5, abs=0.05)
-    assert stage.program.log.notes[3:5] == ["walk: it halts, and then stands", "walk -> stand"]
+    assert stage.program.log.notes[3:5] == ["walk: the robot halts, and then stands", "walk -> stand"]
 
 
 def test_one_that_halts_can_walk_on_and_can_be_stopped(stage):
     plan = {**WALKS, 3.1: (0.5, 0.0, 0.0), 5.0: STAND, 5.2: WALK, 7.0: STAND, 7.2: Event.STOP, 8.0: QUIT}
     stage.run(plan)
-    said = ["walk: it halts, and then stands", "walk: it walks on", "walk: it halts, and then stands", "stop: operator: stop"]
+    said = [
+        "walk: the robot halts, and then stands",
+        "walk: the robot walks on",
+        "walk: the robot halts, and then stands",
+        "stop: operator: stop",
+    ]
     assert stage.program.log.notes[3:7] == said
     cycles = stage.program.log._cycles
     assert cycles["command"][np.searchsorted(cycles["times"], 6.9)][0] == pytest.approx(0.5)
@@ -116,18 +121,18 @@ def test_it_does_not_walk_before_it_stands_nor_stand_up_when_something_is_wrong(
 
     stage.run({0.0: STAND, 0.1: DAMPING, 0.5: STAND, 2.0: STAND, 3.0: WALK, 5.0: QUIT}, {1.0: right})
     assert stage.program.log.notes[:5] == [
-        "refused: 'stand' leads nowhere from idle",
+        "refused: 'stand' is not possible in the state idle",
         "idle -> damping",
         "refused: stand: tilt: 2.00 rad (allowed: 1)",
         "damping -> stand",
-        "refused: walk: it stands up for 2 s first",
+        "refused: walk: the robot first stands up, for 2 s",
     ]
 
 
 def test_before_anything_was_read_it_cannot_stand_up(stage):
     stage.robot.silent = True
     stage.run({0.0: DAMPING, 0.1: STAND, 0.5: QUIT})
-    assert stage.program.log.notes[1] == "refused: stand: no data: nothing has been read yet"
+    assert stage.program.log.notes[1] == "refused: stand: no data: no reading has arrived yet"
 
 
 def test_commands_are_ramped_and_stay_within_what_the_policy_knows(stage):
@@ -153,7 +158,7 @@ def test_a_policy_that_was_never_asked_to_stand_still_can_be_halted(stage):
     forward = commands[np.searchsorted(times, [3.1, 3.9, 4.15, 4.9, 5.9]), 0]
     np.testing.assert_allclose(forward, [0.0, 0.3, 0.15, 0.0, 0.3], atol=0.03)
     assert times[np.flatnonzero(states == 3)[-1]] == pytest.approx(7.3, abs=0.05)
-    assert stage.program.log.notes[3:5] == ["walk: it halts, and then stands", "walk -> stand"]
+    assert stage.program.log.notes[3:5] == ["walk: the robot halts, and then stands", "walk -> stand"]
 
 
 def test_targets_are_clamped_by_hand(stage):

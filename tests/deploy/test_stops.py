@@ -73,7 +73,7 @@ def test_a_joint_that_is_too_fast_for_more_than_an_instant_stops_it(stage, patte
         stage.robot.change = changed
 
     outcome = stage.run({**WALKS, 5.5: QUIT}, {4.0: begin})
-    assert outcome.stops == (("joint speed: LF_HFE has been faster than that (allowed: 24.0 rad/s for 40 ms)",) * stops)
+    assert outcome.stops == (("joint speed: LF_HFE has been faster for too long (allowed: 24.0 rad/s for 40 ms)",) * stops)
 
 
 def test_a_measurement_that_is_sent_again_and_again_is_as_old_as_the_first_time(stage):
@@ -168,8 +168,8 @@ def test_the_operator_stops_it_and_it_goes_on_only_by_damping(stage):
     assert stage.program.log.notes[3:] == [
         "stop: operator: stop",
         "walk -> stop",
-        "refused: 'walk' leads nowhere from stop",
-        "refused: 'stand' leads nowhere from stop",
+        "refused: 'walk' is not possible in the state stop",
+        "refused: 'stand' is not possible in the state stop",
         "stop -> damping",
         "damping -> stand",
         "stand -> walk",

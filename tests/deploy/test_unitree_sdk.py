@@ -108,8 +108,8 @@ def test_unitrees_simulator_has_no_controller_that_must_be_left(monkeypatch):
 @pytest.mark.parametrize(
     ("mode", "says"),
     [
-        ((3104, None), "nobody says whether the robot's own controller is on; is --network the right one"),
-        ((0, {"name": "mcf"}), "the robot's own controller is still on after 10 s; leave it by hand"),
+        ((3104, None), "the robot does not say if its own controller is on; check --network"),
+        ((0, {"name": "mcf"}), "the robot's own controller is still on after 10 s; switch it off by hand"),
     ],
 )
 def test_a_robot_that_does_not_answer_is_not_said_to_keep_its_controller(monkeypatch, mode, says):

@@ -58,7 +58,7 @@ def test_a_run_has_its_episodes_beside_it_and_they_are_listed_again(capsys, monk
     out = capsys.readouterr().out
     assert len(re.findall(r"(?m)^│ +\d+ │", out)) == 1
     assert call(list_.main, [str(run / "episodes"), "--page", "3"]) == 2
-    assert "--page: there is no episode 3; they are 0 to 2" in capsys.readouterr().err
+    assert "--page: there is no episode 3; episodes are numbered 0 to 2" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -153,13 +153,13 @@ def test_two_policies_are_compared(capsys):
     ("arguments", "words"),
     [
         (["anymal_c_flt"], "POLICY: there is no task and no run 'anymal_c_flt'; did you mean 'anymal_c_flat'?"),
-        ([*HERE, "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
+        ([*HERE, "--sort", "energi"], "--sort: cannot sort by 'energi'; did you mean 'energy'?"),
         ([*HERE, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         ([*HERE, "--episodes", "100000"], "--episodes: must be at most 4,096, got 100,000"),
-        ([*HERE, "--num-envs", "9"], "--num-envs: 9 robots have no more than 3 episodes to run"),
+        ([*HERE, "--num-envs", "9"], "--num-envs: 9 robots are too many for 3 episodes"),
         ([*HERE, "--ended", "contakt"], "--ended: contakt: no episode ends by it; did you mean 'contact'?"),
         ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
-        ([*HERE, "--page", "7"], "--page: there is no episode 7; they are 0 to 2"),
+        ([*HERE, "--page", "7"], "--page: there is no episode 7; episodes are numbered 0 to 2"),
         ([*HERE, "--top", "-1"], "--top: must be at least 0"),
         ([*HERE, "--command", "1,0,nan"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0,nan'"),
         ([*HERE, "--command", "1,0"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0'"),
@@ -182,7 +182,7 @@ def test_what_cannot_be_is_refused_before_anything_is_built(arguments, words, ca
     ("command", "arguments", "words"),
     [
         (list_, ["nowhere"], "FOLDER: nowhere holds no episodes.npz"),
-        (list_, ["nowhere", "--sort", "energi"], "--sort: there is no order 'energi'; did you mean 'energy'?"),
+        (list_, ["nowhere", "--sort", "energi"], "--sort: cannot sort by 'energi'; did you mean 'energy'?"),
         (list_, ["nowhere", "--episodes", "3"], "unrecognized arguments: --episodes"),
         (compare, ["a", "b"], "POLICY: there is no task and no run 'a'"),
         (compare, [TASK, "b"], "POLICY: there is no task and no run 'b'"),

@@ -79,7 +79,7 @@ def test_wrong_limits_are_refused(capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ([*HERE, "--checkpoint", "3"], "--checkpoint: all checkpoints of the run are measured"),
+        ([*HERE, "--checkpoint", "3"], "--checkpoint: leave it out, because all checkpoints of the run are measured"),
         ([*HERE, "--types", "pit"], "unrecognized arguments: --types"),
         ([*HERE, "--physics", "all"], "command line: sim.physics: unknown value 'all'"),
         (["half_cheetah"], "POLICY: 'half_cheetah' has no velocity commands"),

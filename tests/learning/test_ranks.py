@@ -271,7 +271,7 @@ def test_each_process_has_the_gpu_of_its_number(monkeypatch):
     with pytest.raises(ConfigError, match="one device for 2 processes"):
         pick_device("cuda:0")
     as_rank(monkeypatch, 2, 3)
-    with pytest.raises(ConfigError, match="3 processes want a GPU each, but torch sees 2"):
+    with pytest.raises(ConfigError, match="3 processes need a GPU each, but torch sees 2"):
         pick_device(None)
 
 

@@ -185,7 +185,7 @@ def test_among_others_a_task_without_commands_is_left_out_and_named(tmp_path, ca
             shutil.copy(POLICY.parent / task / name, tmp_path / task)
     (found,) = find_runs([tmp_path])
     assert found.folder == tmp_path / "anymal_c_flat"
-    assert capsys.readouterr().err == f"left out, for their tasks follow no commands: {tmp_path / 'half_cheetah'}\n"
+    assert capsys.readouterr().err == f"left out, because their tasks follow no commands: {tmp_path / 'half_cheetah'}\n"
     shutil.rmtree(tmp_path / "anymal_c_flat")
     with pytest.raises(ConfigError, match="'half_cheetah' follows no commands"):  # nothing is left
         find_runs([tmp_path])
@@ -201,7 +201,7 @@ def test_among_others_a_run_that_this_version_cannot_read_is_left_out_and_why(tm
     (found,) = find_runs([tmp_path])
     assert found.folder == tmp_path / "new"
     said = capsys.readouterr().err
-    assert said.startswith(f"left out, for its configuration can't be read ({path}: ")
+    assert said.startswith(f"left out, because its configuration can't be read ({path}: ")
     assert "did you mean 'env'" in said
     assert said.endswith(f"): {tmp_path / 'old'}\n")
     with pytest.raises(ConfigError, match="did you mean 'env'"):  # it was asked for by itself

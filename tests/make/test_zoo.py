@@ -210,7 +210,7 @@ def test_a_shipment_leaves_nothing_of_the_one_before_it():
     assert (place / "seed_2" / "evaluation_mujoco.json").exists()  # the old one is there as it was
     (run / "model_0.pt").write_bytes(whole)
     lines = ship(find_runs([run]), Path("shipped"))
-    assert lines[1:] == [f"{place}: shows the policy before; draw it anew: play.gif"]
+    assert lines[1:] == [f"{place}: pictures show the earlier policy; draw them again: play.gif"]
     names = {str(path.relative_to(place)) for path in place.rglob("*") if path.is_file()}
     assert names == {"model.pt", "config.yaml", "timing.json", "play.gif", "seed_3/own.txt"}
     assert not (place / "seed_2").exists()
@@ -232,7 +232,7 @@ def test_stress_tests_of_the_policy_are_shipped_with_it():
 def test_a_shipped_policy_is_not_shipped_over_itself():
     ship(find_runs([tiny_run(iterations=1)]), Path("shipped"))
     before = {path: path.read_bytes() for path in Path("shipped").rglob("*.*")}
-    with pytest.raises(ConfigError, match=f"--ship: shipped/{TASK} is shipped there already"):
+    with pytest.raises(ConfigError, match=f"--ship: shipped/{TASK} is in that folder already"):
         ship(find_runs([Path("shipped")]), Path("shipped"))
     assert {path: path.read_bytes() for path in Path("shipped").rglob("*.*")} == before
 
@@ -245,7 +245,7 @@ def test_a_shipped_policy_is_not_shipped_over_itself():
         (["half_cheetah"], "'half_cheetah' follows no commands"),
         ([TASK, TASK], f"zoo: '{TASK}' is named twice"),
         ([TASK, "--seeds", "1,x"], "--seeds: '1,x' is not a list of whole numbers, like 1,2,3"),
-        ([TASK, "--seeds", "1,1"], "--seeds: '1,1' names one twice"),
+        ([TASK, "--seeds", "1,1"], "--seeds: '1,1' names a seed twice"),
         ([TASK, "--jobs", "0"], "--jobs: must be at least 1, got 0"),
         ([TASK, "--engines", "mujoco_wrap"], "--engines: there is no engine 'mujoco_wrap'; did you mean 'mujoco_warp'?"),
         ([TASK, "--robots-per-point", "0"], "--robots-per-point: must be at least 1, got 0"),

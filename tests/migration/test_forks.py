@@ -416,7 +416,9 @@ def test_a_robot_whose_feet_have_several_shapes(migrated):
 def test_nothing_is_run_unless_asked_for(capsys):
     written("open('run.txt', 'w').write('x')\n" + BASE + FLAT)
     assert call(migrate.main, ["fork_config.py"]) == 2
-    assert "legged migrate runs fork_config.py and the modules that it imports; say --run for that" in capsys.readouterr().err
+    assert (
+        "legged migrate runs fork_config.py and the modules that it imports; allow this with --run" in capsys.readouterr().err
+    )
     assert not Path("run.txt").exists()
     assert call(migrate.main, ["fork_config.py", "--run"]) == 0
     assert Path("run.txt").exists()

@@ -199,7 +199,7 @@ def test_files_are_not_written_over_unless_asked_to(migrated, refused):
     migrated(BASE + FLAT)
     before = Path("plain.yaml").read_text()
     Path("plain.yaml").write_text("mine")
-    assert "--out: plain.yaml is there already; --force writes over it" in refused("fork_config.py")
+    assert "--out: plain.yaml exists already; --force writes over it" in refused("fork_config.py")
     assert Path("plain.yaml").read_text() == "mine"
     migrated(BASE + FLAT, "--force")
     assert Path("plain.yaml").read_text() == before

@@ -172,17 +172,17 @@ def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys
     command = ["--command", "0,0,0", "--seconds", "2.1"]
     assert call(evaluate_onnx.main, [str(policy), *command]) == 0
     said = capsys.readouterr().err
-    assert ("policy.json: the policy was trained with motors that are not ideal" in said) == warns
+    assert ("policy.json: the policy was trained with other motors" in said) == warns
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "bias", "says"),
     [
-        ({"stiffness": [900.0] * 12}, 0.0, "stiffness: is not that of"),
+        ({"stiffness": [900.0] * 12}, 0.0, "stiffness: differs from that of"),
         ({"damping": [0.0] * 12}, 0.0, "damping: must be above 0"),
         ({"control_dt": 0.0005}, 0.0, "control_dt: must be between 0.001 and 1, got 0.0005"),
-        ({"joint_names": list(reversed(load_robot("anymal_c").joint_names))}, 0.0, "joint_names: is not that of"),
+        ({"joint_names": list(reversed(load_robot("anymal_c").joint_names))}, 0.0, "joint_names: differs from that of"),
         ({}, math.nan, "policy.onnx: gives actions that are not finite"),
     ],
     ids=["gains", "damping", "control_dt", "joints", "NaN"],
@@ -244,7 +244,7 @@ def test_policies_that_cannot_be_played(tmp_path):
         ({"control_type": "V"}, "control_type: got 'V'"),
         ({"recurrent": memory}, "has a memory"),
         ({"observation_groups": [{**group, "history": 3}]}, "has a memory"),
-        ({"observation": uneven}, "columns of 'base_lin_vel' have scales of their own"),
+        ({"observation": uneven}, "the columns of 'base_lin_vel' have different scales"),
         ({"observation": [heights, *terms[1:]]}, "there is no term 'heights'"),
         ({"damping": None}, "is no policy.json"),
     ):

@@ -46,11 +46,11 @@ public:
             if (layer.kind == activation && layer.detail >= activations)
                 throw std::runtime_error(path + ": has a layer that this program does not know");
             if ((layer.kind == activation || layer.kind == normalise || layer.kind == keep) && layer.inputs != layer.outputs)
-                throw std::runtime_error(path + ": has a layer that changes a width it cannot change");
+                throw std::runtime_error(path + ": has a layer whose outputs must be as many as its inputs");
             if (layer.kind == keep) kept = layer.inputs;
             if (layer.kind == join) {
                 if (kept == 0 || layer.outputs != kept + layer.inputs)
-                    throw std::runtime_error(path + ": has a layer that joins what was not kept");
+                    throw std::runtime_error(path + ": has a layer JOIN without a layer KEEP that fits");
                 kept = 0;
             }
             if (kept_.size() < kept) kept_.resize(kept);
@@ -69,7 +69,7 @@ public:
             if (x_.size() < width) x_.resize(width), y_.resize(width);
             layers_.push_back(layer);
         }
-        if (file.peek() != std::ifstream::traits_type::eof()) throw std::runtime_error(path + ": is longer than it says");
+        if (file.peek() != std::ifstream::traits_type::eof()) throw std::runtime_error(path + ": is longer than its layers");
         if (layers_.empty()) throw std::runtime_error(path + ": has no layers");
     }
 
