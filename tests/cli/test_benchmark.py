@@ -235,7 +235,7 @@ def test_sizes_are_numbers(sizes, capsys):
 @pytest.mark.parametrize("option", ["--num-envs", "--num_envs"])
 def test_scale_sets_the_number_of_robots_itself(option, capsys):
     assert call(scale.main, ["anymal_c", "--sim-device", "cpu", "--robots", "4", option, "4"]) == 2
-    assert capsys.readouterr().err.startswith("error: --num-envs: --robots")
+    assert capsys.readouterr().err.startswith("error: --num-envs: leave it out, because --robots")
 
 
 @pytest.mark.slow
