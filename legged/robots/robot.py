@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,11 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
-from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
+from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air, wheel_gains
 from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
-from legged.robots.patterns import match_values
+from legged.robots.patterns import match_names, match_values
 from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
 from legged.robots.stance import standing_height, swinging_joints
@@ -48,6 +49,8 @@ class RobotFile:
     """Patterns of the shapes whose contact ends the episode."""
     passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints without a motor: springs, rods, parts of closed loops. Slides and balls are allowed."""
+    wheels: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Patterns of the joints that turn wheels. Their angles have no meaning: they are neither observed nor rewarded."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +74,14 @@ class Robot:
     torque_limits: np.ndarray
     """(D,) [N m]."""
     stiffness: np.ndarray
-    """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
+    """(D,) P gains [N m/rad], and D gains [N m s/rad]; of wheels, gains on their speed [N m s/rad] and acceleration."""
     damping: np.ndarray
     armature: np.ndarray
     """(D,) inertia of rotor and gear, as seen at the joint [kg m^2]."""
     inertia: np.ndarray
     """(D,) inertia that the motor of each joint turns with the robot in the air in its default pose [kg m^2]."""
+    wheels: np.ndarray
+    """(D,) True if the joint turns a wheel."""
     swings: np.ndarray
     """(D,) True if the joint swings a leg forward and back in the default pose."""
     height: float
@@ -125,13 +130,19 @@ class Robot:
     def model_path(self) -> Path:
         return self.folder / self.file.model
 
-    def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
-        """Return the values (D,) of a pattern table.
+    @property
+    def without_wheels(self) -> tuple[int, ...]:
+        """Indices of the joints that are no wheels: those whose angles have a meaning."""
+        return tuple(int(i) for i in np.flatnonzero(~self.wheels))
+
+    def each(self, value: Any, where: str) -> np.ndarray:
+        """Return a value for each joint, (D,): those of a pattern table, or the same for all.
 
         Raises:
             ConfigError: a pattern matches no joint, or no pattern matches a joint.
         """
-        return match_values(table, self.joint_names, where)
+        table = isinstance(value, Mapping)
+        return match_values(value, self.joint_names, where) if table else np.full(self.num_dof, value)
 
     def with_armature(self, armature: np.ndarray) -> "Robot":
         """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` counts only the
@@ -167,15 +178,17 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     foot_ids = [model.geom(name).id for foot in shapes.feet_shapes for name in foot]
     qpos = default_qpos(model, numbers, default, passive, f"{path}: default_joint_angles")
     height, torque_limits = standing_height(model, file.base, qpos), model.actuator_forcerange[:, 1].copy()
+    wheels = np.isin(np.arange(len(names)), match_names(file.wheels, names, f"{path}: wheels"))
+    if file.velocity_limit:
+        velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
+    else:
+        velocity_limits = np.full(len(names), VELOCITY_LIMIT)
     if file.stiffness or file.damping:
         stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
         damping = match_values(file.damping, names, f"{path}: damping")
     else:
         stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height)
-    if file.velocity_limit:
-        velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
-    else:
-        velocity_limits = np.full(len(names), VELOCITY_LIMIT)
+        stiffness[wheels], damping[wheels] = wheel_gains(model, qpos, numbers, torque_limits, velocity_limits)[wheels], 0.0
     return Robot(
         name=folder.name,
         folder=folder,
@@ -189,6 +202,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         damping=damping,
         armature=model.dof_armature[[int(joint.dofadr[0]) for joint in joints]],
         inertia=inertia_in_air(model, qpos, numbers),
+        wheels=wheels,
         swings=swinging_joints(model, qpos, numbers, foot_ids),
         height=height,
         qpos_columns=tuple(int(joint.qposadr[0]) for joint in joints),
