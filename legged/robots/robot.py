@@ -1,6 +1,6 @@
 """Robots: names, indices, limits and gains, read from a robot folder (robot.yaml and MJCF)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,12 @@ from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_names, match_values
-from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
+from legged.robots.robot_model import aimless_shapes, base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
 from legged.robots.stance import standing_height, swinging_joints
+
+SLACK = 1e-3
+"""Largest distance of a default angle from its joint's range that counts as rounding [rad]."""
 
 
 @dataclass(frozen=True)
@@ -172,6 +175,8 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     joints = [model.joint(i) for i in driven_joints(model, undriven)]
     names = tuple(joint.name for joint in joints)
     default = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float)
+    _check_default(default, limits, names, str(path))
     numbers = [joint.id for joint in joints]
     passive = PassiveJoints.of(model, numbers, undriven) if undriven else None
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
@@ -195,7 +200,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         file=file,
         joint_names=names,
         default_dof_pos=default,
-        dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
+        dof_pos_limits=limits,
         dof_vel_limits=velocity_limits,
         torque_limits=torque_limits,
         stiffness=stiffness,
@@ -218,9 +223,22 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        adaptations=adaptations(folder / file.model),
+        adaptations=(*adaptations(folder / file.model), *aimless_shapes(model)),
         mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
+
+
+def _check_default(default: np.ndarray, limits: np.ndarray, names: Sequence[str], where: str) -> None:
+    """Check that default angles (D,) are within the limits (D, 2) of the joints `names`.
+
+    Raises:
+        ConfigError: one is not; `where` is the file of the angles.
+    """
+    for name, angle, (low, high) in zip(names, default, limits, strict=True):
+        if not low - SLACK <= angle <= high + SLACK:
+            raise ConfigError(
+                f"{where}: default_joint_angles: {angle:g} rad for '{name}' is outside its range, {low:g} to {high:g} rad"
+            )
 
 
 def _folder(name: str, where: str) -> Path:
