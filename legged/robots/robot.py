@@ -1,6 +1,6 @@
 """Robots: names, indices, limits and gains, read from a robot folder (robot.yaml and MJCF)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
-from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air, wheel_gains
+from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
 from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
@@ -176,7 +176,10 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     names = tuple(joint.name for joint in joints)
     default = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
     limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float)
-    _check_default(default, limits, names, str(path))
+    for name, angle, (low, high) in zip(names, default, limits, strict=True):
+        if not low - SLACK <= angle <= high + SLACK:
+            told = f"{angle:g} rad for '{name}' is outside its range, {low:g} to {high:g} rad"
+            raise ConfigError(f"{path}: default_joint_angles: {told}")
     numbers = [joint.id for joint in joints]
     passive = PassiveJoints.of(model, numbers, undriven) if undriven else None
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
@@ -192,8 +195,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
         damping = match_values(file.damping, names, f"{path}: damping")
     else:
-        stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height)
-        stiffness[wheels], damping[wheels] = wheel_gains(model, qpos, numbers, torque_limits, velocity_limits)[wheels], 0.0
+        stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height, wheels * velocity_limits)
     return Robot(
         name=folder.name,
         folder=folder,
@@ -226,19 +228,6 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         adaptations=(*adaptations(folder / file.model), *aimless_shapes(model)),
         mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
-
-
-def _check_default(default: np.ndarray, limits: np.ndarray, names: Sequence[str], where: str) -> None:
-    """Check that default angles (D,) are within the limits (D, 2) of the joints `names`.
-
-    Raises:
-        ConfigError: one is not; `where` is the file of the angles.
-    """
-    for name, angle, (low, high) in zip(names, default, limits, strict=True):
-        if not low - SLACK <= angle <= high + SLACK:
-            raise ConfigError(
-                f"{where}: default_joint_angles: {angle:g} rad for '{name}' is outside its range, {low:g} to {high:g} rad"
-            )
 
 
 def _folder(name: str, where: str) -> Path:

@@ -26,8 +26,8 @@ def read(tmp_path, head="", joint="", body="", tendon="", actuator=MOTORS):
     ("parts", "says"),
     [
         ({"tendon": TENDON.format('stiffness="0.1"')}, "tendons are left out: band (stiffness)"),
-        ({"tendon": TENDON.format('damping="1" range="-1 1"')}, "tendons are left out: band (damping, range)"),
-        ({"body": 'gravcomp="0.01"'}, "gravity compensation of bodies is left out: b"),
+        ({"tendon": TENDON.format('damping="1" range="-1 1"')}, "tendons are left out: band (damping, limited)"),
+        ({"body": 'gravcomp="0.01"'}, "gravity compensation is left out: b"),
         ({"joint": 'stiffness="1 .2"'}, "springs of joints that are not linear become linear: a"),
         ({"head": '<option density="1.2"/>'}, "drag of air and water is left out: density"),
         ({"actuator": SERVO.format('dyntype="filterexact" dynprm=".04"')}, "late: s (filterexact, 0.04 s)"),
@@ -35,7 +35,7 @@ def read(tmp_path, head="", joint="", body="", tendon="", actuator=MOTORS):
         ({"joint": 'actuatorfrcrange="-5 8"'}, "become the smaller one: a (-5 to 8 N m)"),
         (
             {"actuator": SERVO.replace('gainprm="9"', 'gaintype="affine" gainprm="9 1"').format("")},
-            "left out: s (gain affine)",
+            "law here: s (gain affine, bias affine)",
         ),
     ],
 )

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, gains, inertia_in_air, mass_matrix, standing_torques, wheel_gains
+from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, gains, inertia_in_air, mass_matrix, standing_torques
 from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
 
@@ -68,13 +68,9 @@ def rule_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str], height
     model, qpos = poser.model, poser.pose(angles).qpos.copy()
     joints, shapes = [int(model.joint(hinge.name).id) for hinge in driven], [int(model.geom(name).id) for name in feet]
     effort = np.array([hinge.effort or 0.0 for hinge in driven])
-    stiffness, damping = gains(model, qpos, joints, shapes, effort, height)
-    wheels = np.array([hinge.rolls for hinge in driven])
-    speeds = np.array([hinge.velocity or VELOCITY_LIMIT for hinge in driven])
-    stiffness = np.where(wheels, wheel_gains(model, qpos, joints, effort, speeds), stiffness)
-    tables = zip(stiffness, np.where(wheels, 0.0, damping), strict=True)
-    p, d = zip(*tables, strict=True)
-    return tuple(dict(zip((h.name for h in driven), map(float, values), strict=True)) for values in (p, d))
+    rolling = np.array([(hinge.velocity or VELOCITY_LIMIT) * hinge.rolls for hinge in driven])
+    both = gains(model, qpos, joints, shapes, effort, height, rolling)
+    return tuple(dict(zip((hinge.name for hinge in driven), values.tolist(), strict=True)) for values in both)
 
 
 def take_gains(

@@ -143,9 +143,8 @@ class Tree:
         found = dict(angles)
         for loop in self.loops:
             if loop["tag"] == "joint" and "joint2" in loop:
-                found[loop["joint1"]] = float(
-                    np.polynomial.Polynomial(vector_of(loop["polycoef"]))(found.get(loop["joint2"], 0.0))
-                )
+                polynomial = np.polynomial.Polynomial(vector_of(loop["polycoef"]))
+                found[loop["joint1"]] = float(polynomial(found.get(loop["joint2"], 0.0)))
         return found
 
     def turn(self, quat: Vector) -> None:
