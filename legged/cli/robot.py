@@ -1,8 +1,11 @@
 """`legged robot`: make robots from files, and show them."""
 
 import argparse
+import contextlib
 import shlex
+import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +15,22 @@ from rich.table import Table
 from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.errors import ConfigError, suggest
+from legged.physics.standing import height_under_gains
 from legged.process.command_parser import argument
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
+from legged.robots.importing.actuation import growth
 from legged.robots.importing.folder import Guesses, called, task_yaml, write_folder
 from legged.robots.importing.infer import make_ready, read_robot
 from legged.robots.importing.menagerie import PREFIX, menagerie_model
 from legged.robots.importing.repair import plain
 from legged.robots.importing.tree import Tree
-from legged.robots.robot import load_robot
+from legged.robots.robot import Robot, load_robot
 
+SINKS, STANDS = 0.8, 0.85
+"""A robot sinks whose base comes to rest below the first share of its height; raised gains reach the second one."""
+RAISED = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
+"""Factors on the rule's P gains that are tried; D gains grow with their roots."""
 ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
 
@@ -33,7 +42,7 @@ ROOM_MB = 100.0
         argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
         argument("--name", help="name of the robot; by default the name of the file"),
         argument("--out", type=Path, help="folder for the robot's folder and its task; by default the folders of this clone"),
-        argument("--extends", metavar="TASK", help="task to extend; by default base/quadruped_flat or base/biped_flat"),
+        argument("--extends", metavar="TASK", help="task to extend; one of base/ by default"),
         argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated"),
         argument(
             "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
@@ -68,18 +77,57 @@ def add(args: argparse.Namespace) -> int:
             _check_apart(mesh.file, folder)
     tree.name = name
     guesses = make_ready(tree, args.hold, gains)
-    megabytes = write_folder(folder, tree, guesses, source, licence)
-    robot = load_robot(str(folder))
-    where = name if folder.parent == data_folder("resources") / "robots" else f"./{name}"
-    extends = args.extends or f"base/{'biped' if guesses.legs == 2 else 'quadruped'}_flat"
-    make_folder(task.parent)
-    symmetric = robot.mirror is not None and robot.mirror.uneven_joint(robot.default_dof_pos) is None
-    write_text(task, task_yaml(name, where, extends, symmetric))
+    with _nothing_left(folder, task):
+        megabytes = write_folder(folder, tree, guesses, source, licence)
+        if _make_stand(load_robot(str(folder)), tree, guesses):
+            write_folder(folder, tree, guesses, source, licence)
+        robot = load_robot(str(folder))
+        where = name if folder.parent == data_folder("resources") / "robots" else f"./{name}"
+        kind = "wheeled" if guesses.wheels else "biped" if guesses.legs == 2 else "quadruped"
+        extends = args.extends or f"base/{kind}_flat"
+        make_folder(task.parent)
+        symmetric = robot.mirror is not None and robot.mirror.uneven_joint(robot.default_dof_pos) is None
+        write_text(task, task_yaml(name, where, extends, symmetric, guesses))
+        task_config(register_file(str(task)), on_cpu=True)
     _report(tree, guesses, folder, task, megabytes)
-    task_config(register_file(str(task)), on_cpu=True)
     own = task.parent == data_folder("cfg")
     print(f"train it: legged train {shlex.quote(str(task.stem if own else relative(task)))}")
     return 0
+
+
+@contextlib.contextmanager
+def _nothing_left(folder: Path, task: Path) -> Iterator[None]:
+    """Remove what was written into a new robot folder, and the task's file, if an error follows."""
+    new = [path for path in (folder, task, folder.parent) if not exists(path)]
+    try:
+        yield
+    except ConfigError:
+        for path in new:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        raise
+
+
+def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
+    """Test whether a robot stands by itself under its gains, and report the result. If it does not and a rule has chosen the
+    gains, raise them as far as an explicit control law is stable. Return True if a line was added.
+    """
+    height = height_under_gains(robot, robot.stiffness, robot.damping)
+    if height >= SINKS * robot.height:
+        return False
+    sinks = f"in C MuJoCo the base sinks from {robot.height:.3g} to {height:.3g} m in the default pose"
+    bends = np.where(robot.wheels, 0.0, 1.0)
+    for factor in RAISED if not guesses.stiffness else ():
+        p, d = (gains * (1.0 + bends * (by - 1.0)) for gains, by in ((robot.stiffness, factor), (robot.damping, factor**0.5)))
+        raised = [dict(zip(robot.joint_names, map(float, gains), strict=True)) for gains in (p, d)]
+        if growth(tree, guesses.angles, *raised) > 1.0:
+            break
+        higher = height_under_gains(robot, p, d)
+        if higher >= STANDS * robot.height:
+            guesses.stiffness, guesses.damping = raised
+            tree.say(f"guess: gains are {factor:g} times the rule's, with which {sinks}; with these to {higher:.3g} m")
+            return True
+    tree.say(f"{sinks}: look at the gains, at the inertia of rotors (armature), or give --stiffness and --damping")
+    return True
 
 
 def _gains(args: argparse.Namespace) -> tuple[float, float] | None:
@@ -139,7 +187,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
     driven = sum(hinge.driven for hinge in tree.hinges)
     mass = sum(link.mass for link in tree.links)
     counts = f"{len(tree.hinges)} hinges, {driven} motors, {len(tree.shapes)} shapes"
-    print(f"{tree.name}: a {called(guesses.legs)} of {mass:.4g} kg, {counts}")
+    print(f"{tree.name}: a {called(guesses.legs, bool(guesses.wheels))} of {mass:.4g} kg, {counts}")
     for line in tree.said:
         print(f"  {line}")
     for title, names in (("is penalised", guesses.penalized), ("ends an episode", guesses.terminating)):

@@ -187,11 +187,11 @@ def _effect(task: BaseTask, i: int) -> str:
     scales = dict(zip(control.acted, action_scales(task.robot, law).tolist(), strict=True))
     if i not in scales:
         target = f"position {float(task.default_dof_pos[i]):g} [rad], held"
-    elif law.control_type == "P":
+    elif control.laws[i] == "P":
         target = f"position {float(task.default_dof_pos[i]):g} + {scales[i]:g} a [rad]"
     else:
-        target = f"{'velocity' if law.control_type == 'V' else 'torque'} {scales[i]:g} a"
-    gains = "" if law.control_type == "T" else f", stiffness {p:g}, damping {d:g}"
+        target = f"{'velocity' if control.laws[i] == 'V' else 'torque'} {scales[i]:g} a"
+    gains = "" if control.laws[i] == "T" else f", stiffness {p:g}, damping {d:g}"
     motor = "" if control.actuator is None else f"; {control.actuator.describe(i)}"
     rotor = f", rotor {task.robot.armature[i]:g} kg m^2" if task.robot.armature[i] else ""
     return f"{joint}: {target}{gains}, torque at most {limit:g} N m{rotor}{motor}"

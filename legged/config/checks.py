@@ -105,6 +105,7 @@ def _origin(path: str, origins: Origins, source: str) -> str:
 
 WORDS = {
     float: "a number",
+    Literal: "a name",
     tuple: "[low, high]",
     dict: "a mapping from names to numbers",
     Mapping: "a mapping with the key range",
@@ -113,14 +114,14 @@ WORDS = {
 
 
 def _shape(kind: Any) -> Any:
-    """Return the kind of value that a type accepts, a key of WORDS: a number, a list, a map, or a section."""
+    """Return the kind of value that a type accepts, a key of WORDS: a number, a name, a list, a map, or a section."""
     origin = typing.get_origin(kind)
-    return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (tuple, dict) else float
+    return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (Literal, tuple, dict) else float
 
 
 def _has_shape(kind: Any, value: Any) -> bool:
     """Return True if a value is of the kind that a type accepts."""
-    looks_like: dict[Any, Any] = {float: (int, float), tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
+    looks_like: dict[Any, Any] = {float: (int, float), Literal: str, tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
     return isinstance(value, looks_like[_shape(kind)])
 
 

@@ -41,6 +41,8 @@ FASTEST = 20.0
 Axis = tuple[float, float, float]
 """Lowest value, highest value, and step."""
 AXIS = between(-FASTEST, FASTEST)
+Law = Literal["P", "V", "T"]
+"""Control law of a joint."""
 
 
 @dataclass(frozen=True)
@@ -152,19 +154,25 @@ class InitStateConfig:
 class LeggedControlConfig(ControlConfig):
     """Conversion of actions to joint torques."""
 
-    control_type: Literal["P", "V", "T"] = "P"
-    """Meaning of an action: joint position target (P), joint velocity target (V), or torque (T)."""
+    control_type: Law | dict[str, Law] = "P"
+    """Meaning of an action: joint position target (P), joint velocity target (V), or torque (T). One law, or joint-name
+    pattern -> law. The actions of wheels are velocities or torques."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=quantity("N m/rad", between(0, LARGEST)))
     """Joint-name pattern -> P gain [N m/rad]; empty for the robot's gains. A pattern is a part of the joint's name."""
     damping: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
     """Joint-name pattern -> D gain [N m s/rad]; empty for the robot's gains."""
     action_scale: float | dict[str, float] = field(default=0.5, metadata=quantity("rad", positive(LARGEST)))
-    """Scale of the actions; target = action_scale * action + default angle (P) [rad]. One number, or joint-name pattern ->
-    number."""
+    """Scale of the actions; target = action_scale * action + default angle (P) [rad]. For other laws the unit is that of
+    their target [rad/s, N m]. One number, or joint-name pattern -> number."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of joints without an action (P). Their motors hold the default angle with their own gains."""
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
     """Properties of motors that are not ideal: torque limits over speed, friction, delay, learned actuators."""
+
+    @property
+    def laws(self) -> set[str]:
+        """The laws that joints have."""
+        return {self.control_type} if isinstance(self.control_type, str) else set(self.control_type.values())
 
 
 @dataclass(frozen=True)

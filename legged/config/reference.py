@@ -55,9 +55,8 @@ def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[Fie
             yield FieldText(f"{path}.<name>", "a section", None, "", "", meaning, is_section=True)
             yield from fields(typing.cast(type, of_entries), None, f"{path}.<name>.")
         else:
-            choices = (
-                ("true", "false") if hint is bool else typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
-            )
+            literals = [kind for kind in (hint, *typing.get_args(hint)) if typing.get_origin(kind) is Literal]
+            choices = ("true", "false") if hint is bool else typing.get_args(literals[0]) if literals else ()
             unit, bounds = field.metadata.get("unit", ""), bounds_of(field.metadata)
             yield FieldText(path, kind_of(hint), to_dict(value), unit, bounds, meaning, choices)
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from legged.config.checks import shown
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import draw_of
 from legged.config.schema import LeggedConfig
@@ -10,7 +11,7 @@ from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
 from legged.mdp.actuator import check_actuator, check_motor_model, check_slowest
-from legged.mdp.control import acted_joints, action_scales, control_gains
+from legged.mdp.control import acted_joints, action_scales, check_wheels, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
 from legged.physics.fields import FIELDS
 from legged.robots.robot import Robot
@@ -31,6 +32,7 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     control_gains(robot, cfg.control, cfg.origins.where)
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
+    check_wheels(robot, cfg.control, cfg.origins.where)
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
     check_motor_model(cfg.control.actuator, cfg.origins)
     if "velocity_limit" in cfg.domain_rand.ranges:
@@ -64,13 +66,14 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     image = mirror_of_actions(robot.mirror, acted)
     if image is None:
         raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
-    scales = action_scales(robot, cfg.control, origins.where)
-    for i, partner in enumerate(image[0]):
-        if scales[i] != scales[partner]:
-            pair = ", ".join(f"{robot.joint_names[acted[k]]} {scales[k]:g}" for k in sorted((i, partner)))
-            raise ConfigError(
-                f"{origins.where('control.action_scale')}: is not the same left and right ({pair}); {otherwise} ({where})"
-            )
+    laws = robot.each(cfg.control.control_type, origins.where("control.control_type"))[list(acted)].tolist()
+    scales = action_scales(robot, cfg.control, origins.where).tolist()
+    for field, values in (("control_type", laws), ("action_scale", scales)):
+        for i, partner in enumerate(image[0]):
+            if values[i] != values[partner]:
+                pair = ", ".join(f"{robot.joint_names[acted[k]]} {shown(values[k])}" for k in sorted((i, partner)))
+                place = origins.where(f"control.{field}")
+                raise ConfigError(f"{place}: is not the same left and right ({pair}); {otherwise} ({where})")
     used = [term for group in groups_in(cfg).values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     for name in FIELDS:

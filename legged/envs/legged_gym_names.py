@@ -81,7 +81,7 @@ def _friction(task: Any) -> Tensor:
 
 
 def _joint_pos_target(task: Any) -> Tensor:
-    if task.cfg.control.control_type != "P":
+    if task.control.law != "P":
         raise AttributeError("only control.control_type P has joint angles as targets")
     return task.default_dof_pos + task.control.spread(task.actions)
 

@@ -131,7 +131,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
             self.dof_vel_limits = torch.zeros_like(self.dof_vel)
         self._vary_velocity_limits()
         self.dof_pos_limits = self._soft_limits(robot)
-        self.posture_joints = torch.tensor(~robot.swings, dtype=torch.float32, device=device)
+        self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
+        self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
         self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
@@ -200,10 +201,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return HeightMapErrors(cfg, scan, pose, self.heights_seen, self.dt, self.numbers, kernels)
 
     def mirror_images(self) -> MirrorImages | None:
-        mirror, points = self.robot.mirror, self.height_scan.points
-        if mirror is None:
+        if self.robot.mirror is None:
             return None
-        return MirrorImages(type(self).__name__, self.MIRRORED, self.observation_groups, self.control.acted, mirror, points)
+        groups, points = self.observation_groups, self.height_scan.points
+        return MirrorImages(type(self).__name__, self.MIRRORED, groups, self.robot, self.control.acted, points)
 
     # ---- hooks of a control step -------------------------------------------------------------------------------------
 

@@ -30,7 +30,7 @@ def check_randomization(cfg: TaskConfig) -> None:
                 raise ConfigError(
                     f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco also draws later"
                 )
-    if isinstance(cfg, LeggedConfig) and cfg.control.control_type == "T":
+    if isinstance(cfg, LeggedConfig) and cfg.control.laws == {"T"}:
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:
                 where = cfg.origins.where(f"domain_rand.ranges.{name}")
@@ -45,7 +45,7 @@ def check_randomization(cfg: TaskConfig) -> None:
                     f"{cfg.origins.where(f'domain_rand.ranges.{name}')}: all joints have a learned actuator"
                     " (control.actuator.network), which has no gains to draw"
                 )
-    if isinstance(cfg, LeggedConfig) and cfg.control.control_type != "P" and "joint_offset" in rand.ranges:
+    if isinstance(cfg, LeggedConfig) and "P" not in cfg.control.laws and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
         raise ConfigError(f"{where}: control.control_type V does not look at joint angles, so an offset has no effect")
 

@@ -37,7 +37,7 @@ class Terms:
         "base_ang_vel": "rotation",
         "projected_gravity": "vector",
         "commands": "command",
-        "dof_pos": "joints",
+        "dof_pos": "angles",
         "dof_vel": "joints",
         "actions": "actions",
         "heights": "heights",
@@ -98,7 +98,9 @@ class Terms:
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
-    """(D,) 1 for joints that do not swing a leg forward and back, 0 for the others."""
+    """(D,) 1 for joints that neither swing a leg forward and back nor turn a wheel, 0 for the others."""
+    _without_wheels: Tensor | None
+    """Indices of the joints that are no wheels; None if the robot has no wheels."""
     contacts: FeetContacts
     """Contact and swing times of the feet."""
     control: Control
@@ -137,8 +139,8 @@ class Terms:
 
     @unit("rad")
     def _obs_dof_pos(self) -> Tensor:
-        """Joint angle minus default_joint_angles, by joint [rad]."""
-        return self.dof_pos - self.control.zero_dof_pos
+        """Joint angle minus default_joint_angles, by joint, without wheels [rad]."""
+        return self.without_wheels(self.dof_pos - self.control.zero_dof_pos)
 
     @unit("rad/s")
     def _obs_dof_vel(self) -> Tensor:
@@ -171,6 +173,10 @@ class Terms:
         """Return the term `heights` for ground heights (N, P) in the world frame [m]."""
         seen = self.cfg.observations
         return (self.base_pos[:, 2:3] - seen.heights_offset - ground).clamp(-seen.heights_limit, seen.deepest)
+
+    def without_wheels(self, values: Tensor) -> Tensor:
+        """Return those of the values by joint (N, D) that belong to no wheel."""
+        return values if self._without_wheels is None else values.index_select(1, self._without_wheels)
 
     def _force(self, units: float) -> float:
         """Return a force [N] given as a multiple of the contact threshold of this robot's feet."""
@@ -226,14 +232,14 @@ class Terms:
     @concurrent
     @unit("rad^2/s^2")
     def _reward_dof_vel(self) -> Tensor:
-        """Sum of squared joint velocities [rad^2/s^2]."""
-        return self.dof_vel.square().sum(dim=1)
+        """Sum of squared joint velocities, without wheels [rad^2/s^2]."""
+        return self.without_wheels(self.dof_vel).square().sum(dim=1)
 
     @concurrent
     @unit("rad^2/s^4")
     def _reward_dof_acc(self) -> Tensor:
-        """Sum of squared joint accelerations over a control step [rad^2/s^4]."""
-        return squared_difference(self.last_dof_vel, self.dof_vel).sum(dim=1) / self.dt**2
+        """Sum of squared joint accelerations over a control step, without wheels [rad^2/s^4]."""
+        return self.without_wheels(squared_difference(self.last_dof_vel, self.dof_vel)).sum(dim=1) / self.dt**2
 
     @concurrent
     @unit("1")
@@ -257,9 +263,10 @@ class Terms:
     @concurrent
     @unit("rad")
     def _reward_dof_pos_limits(self) -> Tensor:
-        """Angles of joints beyond their soft limits [rad]."""
+        """Angles of joints, without wheels, beyond their soft limits [rad]."""
         low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
-        return ((low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)).sum(dim=1)
+        beyond = (low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)
+        return self.without_wheels(beyond).sum(dim=1)
 
     @concurrent
     @unit("rad/s")
@@ -296,8 +303,8 @@ class Terms:
     @concurrent
     @unit("rad")
     def _reward_stand_still(self) -> Tensor:
-        """Sum of the joints' distances from their default angles, while no motion is commanded [rad]."""
-        return (self.dof_pos - self.default_dof_pos).abs().sum(dim=1) * ~self.is_moving
+        """Sum of the joints' distances from their default angles, without wheels, while no motion is commanded [rad]."""
+        return self.without_wheels((self.dof_pos - self.default_dof_pos).abs()).sum(dim=1) * ~self.is_moving
 
     @concurrent
     @unit("N")
@@ -350,7 +357,7 @@ class Terms:
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
         """Sum of squared distances from the default angles, for joints that do not swing a leg forward: hips that spread or
-        turn, waist, arms [rad^2].
+        turn, waist, arms, but no wheels [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 

@@ -334,8 +334,10 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
     friction_numbers(robot, actuator, where)
     if actuator.network:
         path = where("control.actuator.network")
-        if cfg.control_type != "P":
-            raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {cfg.control_type}")
+        laws = robot.each(cfg.control_type, where("control.control_type"))
+        for law in laws[list(modelled_joints(robot, actuator, where))]:
+            if law != "P":
+                raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {law}")
         NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)
 
 

@@ -27,7 +27,7 @@ class Control:
     V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
     T: action_scale * action
 
-    A of D joints have an action. The others are held: the law takes 0 as their action.
+    Each joint has one of them. A of D joints have an action. The others are held: the law takes 0 as their action.
     """
 
     STATE = ("_last_dof_vel",)
@@ -45,13 +45,19 @@ class Control:
         `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
-            ConfigError: a pattern matches no joint, a joint has no gain or scale, or joints are held by another law than P.
+            ConfigError: a pattern matches no joint, a joint has no law, gain or scale, or joints are held by another law
+                than P.
         """
 
         def tensor(values: np.ndarray) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=torques.device)
 
-        self.control_type, self.sim_dt, self._kernels = cfg.control_type, sim_dt, kernels
+        self.sim_dt, self._kernels = sim_dt, kernels
+        self.laws = tuple(robot.each(cfg.control_type, "control.control_type").tolist())
+        """(D,) law of each joint."""
+        self.law = self.laws[0] if len(set(self.laws)) == 1 else ""
+        """Law of all joints; empty if they have different ones."""
+        self._has = {law: torch.tensor([own == law for own in self.laws], device=torques.device) for law in set(self.laws)}
         self.acted = acted_joints(robot, cfg)
         """(A,) index of each action's joint."""
         scales = action_scales(robot, cfg)
@@ -78,9 +84,8 @@ class Control:
         self.actuator: Actuator | None = None
         """Model of motors that are not ideal; None for ideal motors."""
         if not is_ideal(cfg.actuator):
-            middle = self.default_dof_pos if cfg.control_type == "P" else self._zero
             drawn = numbers or RandomPool(len(torques), torques.device)
-            self.actuator = Actuator(robot, cfg, middle, (len(torques), robot.num_dof), sim_dt, drawn, kernels)
+            self.actuator = Actuator(robot, cfg, self._middle(), (len(torques), robot.num_dof), sim_dt, drawn, kernels)
             self._target = self.actuator.newest
 
     def vary(self, drawn: Mapping[str, Tensor]) -> None:
@@ -102,8 +107,6 @@ class Control:
                 torch.zeros_like(self.torques) + nominal for nominal in (*self.nominal.values(), self._lowest_torques)
             )
             self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
-            if self.actuator is not None and self.control_type == "P":
-                self.actuator.middle = self.zero_dof_pos
         if self._kernels is not None:
             self._factors |= each
             wide = (values.expand_as(self.torques) for values in self._factors.values())
@@ -124,11 +127,17 @@ class Control:
         """Set the actions (N, A) that the following calls of `compute` carry out."""
         if self.actuator is not None:
             self.actuator.advance()
-        middle = self.zero_dof_pos if self.control_type == "P" else self._zero
+        middle = self._middle()
         if self._columns is None and isinstance(self.action_scale, float):
             torch.add(middle, actions, alpha=self.action_scale, out=self._target)
             return
         torch.add(middle, self.spread(actions), out=self._target)
+
+    def _middle(self) -> Tensor:
+        """Return the targets of action 0, (D,), (N, D) or ()."""
+        if not self.law:
+            return torch.where(self._has["P"], self.zero_dof_pos, self._zero) if "P" in self._has else self._zero
+        return self.zero_dof_pos if self.law == "P" else self._zero
 
     def spread(self, actions: Tensor) -> Tensor:
         """Return actions (N, A) times their scales, by joint (N, D). Held joints have 0."""
@@ -138,11 +147,11 @@ class Control:
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""
         if self.actuator is not None:
-            of_law = (self.stiffness, self.damping) if self.control_type == "P" else None
+            of_law = (self.stiffness, self.damping) if self.law == "P" else None
             law = partial(self._law, dof_pos, dof_vel)
             self.actuator.drive(dof_pos, dof_vel, law, of_law, self.torque_limits, self.torques)
             return self.torques
-        if self.control_type == "P" and self._kernels is not None:
+        if self.law == "P" and self._kernels is not None:
             gains = (each.expand_as(self.torques) for each in (self.stiffness, self.damping, self.torque_limits))
             shape = tuple(self.torques.shape)
             self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
@@ -151,22 +160,41 @@ class Control:
         return torch.clamp(asked, self._lowest_torques, self.torque_limits, out=self.torques)
 
     def _law(self, dof_pos: Tensor, dof_vel: Tensor, target: Tensor) -> Tensor:
-        """Return the torques (N, D) [N m] of the law, before the limits of the motors."""
-        if self.control_type == "P":
-            return torch.addcmul(self.stiffness * (target - dof_pos), self.damping, dof_vel, value=-1.0)
-        if self.control_type == "V":
+        """Return the torques (N, D) [N m] of the laws, before the limits of the motors."""
+        torques = target
+        if "V" in self._has:
             acceleration = (dof_vel - self._last_dof_vel) / self.sim_dt
-            torques = self.stiffness * (target - dof_vel) - self.damping * acceleration
+            by_velocity = self.stiffness * (target - dof_vel) - self.damping * acceleration
+            torques = by_velocity if self.law else torch.where(self._has["V"], by_velocity, torques)
             self._last_dof_vel.copy_(dof_vel)
-            return torques
-        return target
+        if "P" in self._has:
+            by_angle = torch.addcmul(self.stiffness * (target - dof_pos), self.damping, dof_vel, value=-1.0)
+            torques = by_angle if self.law else torch.where(self._has["P"], by_angle, torques)
+        return torques
 
     def reset(self, mask: Tensor) -> None:
         """Reset the state of law and actuators of the robots in `mask` (N,)."""
-        if self.control_type == "V":
+        if "V" in self._has:
             masked_set_(self._last_dof_vel, mask, 0.0)
         if self.actuator is not None:
+            self.actuator.middle = self._middle()  # encoder errors may have been drawn anew
             self.actuator.reset(mask)
+
+
+def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> None:
+    """Check that no wheel with an action is turned to an angle. `where` turns a dotted path into the beginning of an error
+    message.
+
+    Raises:
+        ConfigError: a wheel has the law P and is not held.
+    """
+    laws, acted = robot.each(cfg.control_type, where("control.control_type")), acted_joints(robot, cfg, where)
+    for i in acted:
+        if robot.wheels[i] and laws[i] == "P":
+            raise ConfigError(
+                f"{where('control.control_type')}: '{robot.joint_names[i]}' of '{robot.name}' is a wheel; P would turn it to"
+                " an angle, which is not observed: a table (pattern: law) gives it V or T, and control.held holds it"
+            )
 
 
 def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +206,7 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
     """
 
     def gains(name: str, own: dict[str, float], of_robot: np.ndarray) -> np.ndarray:
-        return robot.gains(own, where(f"control.{name}")) if own else of_robot
+        return robot.each(own, where(f"control.{name}")) if own else of_robot
 
     return gains("stiffness", cfg.stiffness, robot.stiffness), gains("damping", cfg.damping, robot.damping)
 
@@ -193,8 +221,9 @@ def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], 
     if not cfg.held:
         return tuple(range(robot.num_dof))
     held = match_names(cfg.held, robot.joint_names, where("control.held"))
-    if cfg.control_type != "P":
-        raise ConfigError(f"{where('control.held')}: joints are held by control_type P only, not {cfg.control_type}")
+    for law in robot.each(cfg.control_type, where("control.control_type"))[list(held)]:
+        if law != "P":
+            raise ConfigError(f"{where('control.held')}: joints are held by control_type P only, not {law}")
     if len(held) == robot.num_dof:
         raise ConfigError(f"{where('control.held')}: every joint of '{robot.name}' is held, so there is no action")
     return tuple(i for i in range(robot.num_dof) if i not in held)

@@ -9,6 +9,7 @@ from torch import Tensor
 from legged.errors import ConfigError
 from legged.mdp.observations import ObservationGroup
 from legged.robots.mirror import Mirror
+from legged.robots.robot import Robot
 
 MirrorKind = Literal[
     "same",
@@ -16,6 +17,7 @@ MirrorKind = Literal[
     "rotation",
     "command",
     "joints",
+    "angles",
     "actions",
     "passive",
     "feet",
@@ -26,10 +28,10 @@ MirrorKind = Literal[
     "of_joints",
 ]
 """Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`:
-(x, y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`, `actions`, `passive` (joints), `feet`: a number for
-each; `heights`: the height scan; `same`: numbers without a side; `scalar`: one number without a side; `sideways`: one number
-that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: a property of each joint that has no
-side, or one number for all joints."""
+(x, y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`, `angles` (joints without wheels), `actions`,
+`passive` (joints), `feet`: a number for each; `heights`: the height scan; `same`: numbers without a side; `scalar`: one
+number without a side; `sideways`: one number that is positive to the left; `vectors`: several vectors, (x, y, z) each;
+`of_joints`: a property of each joint that has no side, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector, so its y component keeps its sign."""
 
@@ -45,20 +47,21 @@ class MirrorImages:
         owner: str,
         kinds: Mapping[str, str],
         groups: Mapping[str, ObservationGroup],
+        robot: Robot,
         acted: Sequence[int],
-        mirror: Mirror,
         points: Tensor,
     ) -> None:
         """Compute the image of every observation group. Actions are mirrored like the term `actions`.
 
-        `kinds` has the `MirrorKind` of each term. `owner` is the name of the task's class, for errors. `acted` (A,) is the
-        joint of each action. `points` (P, 2) are the points of the height scan in the yaw frame [m].
+        `kinds` has the `MirrorKind` of each term. `owner` is the name of the task's class, for errors. `robot` is symmetric.
+        `acted` (A,) is the joint of each action. `points` (P, 2) are the points of the height scan in the yaw frame [m].
 
         Raises:
             ConfigError: a term has no kind, has an unknown kind, or has a width that does not fit its kind.
         """
-        self._owner, self._kinds, self._mirror, self._points = owner, kinds, mirror, points.cpu()
-        self._acted = acted
+        assert robot.mirror is not None
+        self._owner, self._kinds, self._mirror, self._points = owner, kinds, robot.mirror, points.cpu()
+        self._joints = {"actions": acted, "angles": robot.without_wheels}
         device = next(iter(groups.values())).buffer.device
         self.groups = {name: self._group(group) for name, group in groups.items()}
         """Group -> its image, for all steps of its history."""
@@ -102,8 +105,8 @@ class MirrorImages:
             return torch.tensor(self._mirror.joints), torch.tensor(self._mirror.signs)
         if kind == "passive":
             return torch.tensor(self._mirror.passive, dtype=torch.long), torch.tensor(self._mirror.passive_signs)
-        if kind == "actions":
-            image = mirror_of_actions(self._mirror, self._acted)
+        if kind in self._joints:
+            image = mirror_of_actions(self._mirror, self._joints[kind])
             if image is None:
                 raise ConfigError(
                     f"{self._owner}: control.held: joints are held on one side only, so actions have no mirror image"

@@ -104,7 +104,7 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
         result.lose(path, f"says nothing of {', '.join(bare)}; legged_gym gives such joints none")
     numbers = [values[-1] if values else 0.0 for values in wanted.values()]
     if not np.allclose(numbers, own):
-        exact = not bare and np.allclose(numbers, robot.gains(table, name))
+        exact = not bare and np.allclose(numbers, robot.each(table, name))
         by_joint = dict(zip(robot.joint_names, numbers, strict=True))
         few = ", ".join(list(dict.fromkeys(f"{value:g}" for value in own))[:4])
         result.put(path, table if exact else by_joint, path, f"{robot.name} has {few}")

@@ -21,7 +21,7 @@ LAWS = {
     "V": "stiffness * (action_scale * action - dq) - damping * ddq, ddq over one sim_dt",
     "T": "action_scale * action",
 }
-"""control_type -> torque [N m] at joint angle q [rad] and velocity dq [rad/s]; action clipped at action_clip."""
+"""Law of a joint -> torque [N m] at joint angle q [rad] and velocity dq [rad/s]; action clipped at action_clip."""
 SHARED = {
     "observation": "for each term clip(scale * value, -observation_clip, observation_clip), at its columns start to"
     " start + size, without noise",
@@ -84,7 +84,7 @@ def describe_robot(task: LeggedRobot) -> dict[str, Any]:
         "action_joints": [robot.joint_names[i] for i in control.acted],
         "default_joint_angles": control.default_dof_pos.tolist(),
         "crouch_joint_angles": None if bent is None else bent.tolist(),
-        "control_type": cfg.control.control_type,
+        "control_type": control.law or list(control.laws),
         "action_scale": scale if isinstance(scale, float) else scale.tolist(),
         "action_clip": cfg.control.clip_actions,
         "stiffness": control.nominal["p_gain"].tolist(),
@@ -117,7 +117,8 @@ def describe_model(task: BaseTask) -> dict[str, Any]:
 
 def conventions(task: LeggedRobot) -> dict[str, str]:
     """Return the meaning of frames, orders and times, in words."""
-    law = LAWS[task.cfg.control.control_type]
+    laws = task.control.laws
+    law = LAWS[laws[0]] if task.control.law else "; ".join(f"{name} joints: {LAWS[name]}" for name in sorted(set(laws)))
     return {
         "imu_frame": "angular velocity and gravity are those of the frame of this body, which is the base frame: what an IMU"
         " measures that is turned or sits elsewhere must be turned into it",
@@ -168,6 +169,8 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
         entry["deepest"] = legged.deepest
         entry["scan"] = task.cfg.terrain.scan
+    if isinstance(task, LeggedRobot) and term.name == "dof_pos" and task.robot.wheels.any():
+        entry["joints"] = [task.robot.joint_names[i] for i in task.robot.without_wheels]
     if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry

@@ -37,12 +37,20 @@ VELOCITY_LIMIT = 30.0
 
 
 def gains(
-    model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int], effort: np.ndarray, height: float
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    joints: Sequence[int],
+    feet: Sequence[int],
+    effort: np.ndarray,
+    height: float,
+    rolling: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return stiffness [N m/rad] and damping [N m s/rad] (D,) of the hinges `joints` (ids).
 
     `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the motors'
-    torque limits [N m], and `height` the base's height above the ground [m].
+    torque limits [N m], and `height` the base's height above the ground [m]. `rolling` (D,) are the largest speeds of wheels
+    [rad/s], and 0 for other joints. A wheel has a gain on its speed [N m s/rad], and 0: an error of its largest speed demands
+    the whole effort, or less where the explicit law would not be stable with the wheel in the air.
     """
     data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
@@ -61,7 +69,10 @@ def gains(
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
     fastest = TIME_STEP * np.abs(np.linalg.eigvals(inverse[np.ix_(dofs, dofs)] * damping)).max()
-    return stiffness, damping * min(1.0, MARGIN / fastest)
+    damping = damping * min(1.0, MARGIN / fastest)
+    wheels = np.zeros(len(dofs)) if rolling is None else rolling
+    of_wheels = np.minimum(effort / np.maximum(wheels, 1e-9), MARGIN * in_air / TIME_STEP)
+    return np.where(wheels > 0.0, of_wheels, stiffness), np.where(wheels > 0.0, 0.0, damping)
 
 
 def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Patterns in robot.yaml and in tasks. A pattern matches all names that contain it."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,17 +22,17 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tu
     return tuple(i for i, name in enumerate(names) if any(pattern in name for pattern in patterns))
 
 
-def match_values(table: Mapping[str, float], names: Sequence[str], where: str) -> np.ndarray:
+def match_values(table: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
     """Return (len(names),) values: for each name that of the longest pattern that the name contains.
 
     Raises:
         ConfigError: a pattern matches no name, or no pattern matches a name.
     """
     match_names(tuple(table), names, where)
-    values = np.zeros(len(names))
-    for i, name in enumerate(names):
+    values = []
+    for name in names:
         matching = [pattern for pattern in table if pattern in name]
         if not matching:
             raise ConfigError(f"{where}: no pattern matches joint '{name}' (patterns: {', '.join(table) or 'none'})")
-        values[i] = table[max(matching, key=len)]
-    return values
+        values.append(table[max(matching, key=len)])
+    return np.array(values)

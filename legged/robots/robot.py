@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +17,13 @@ from legged.robots.gains import VELOCITY_LIMIT, gains, inertia_in_air
 from legged.robots.importing.convert import adaptations
 from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
-from legged.robots.patterns import match_values
-from legged.robots.robot_model import base_mass, check_model, driven_joints, passive_joints, read_model
+from legged.robots.patterns import match_names, match_values
+from legged.robots.robot_model import aimless_shapes, base_mass, check_model, driven_joints, passive_joints, read_model
 from legged.robots.shapes import Shapes
 from legged.robots.stance import standing_height, swinging_joints
+
+SLACK = 1e-3
+"""Largest distance of a default angle from its joint's range that counts as rounding [rad]."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class RobotFile:
     """Patterns of the shapes whose contact ends the episode."""
     passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints without a motor: springs, rods, parts of closed loops. Slides and balls are allowed."""
+    wheels: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Patterns of the joints that turn wheels. Their angles have no meaning: they are neither observed nor rewarded."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +77,14 @@ class Robot:
     torque_limits: np.ndarray
     """(D,) largest motor torques [N m]."""
     stiffness: np.ndarray
-    """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
+    """(D,) P gains [N m/rad], and D gains [N m s/rad]; of wheels, gains on their speed [N m s/rad] and acceleration."""
     damping: np.ndarray
     armature: np.ndarray
     """(D,) inertia of rotor and gear, reflected to the joint [kg m^2]."""
     inertia: np.ndarray
     """(D,) inertia that each motor turns if the robot is in the air in its default pose [kg m^2]."""
+    wheels: np.ndarray
+    """(D,) True if the joint turns a wheel."""
     swings: np.ndarray
     """(D,) True if the joint swings a leg forward and back in the default pose."""
     height: float
@@ -125,13 +133,19 @@ class Robot:
     def model_path(self) -> Path:
         return self.folder / self.file.model
 
-    def gains(self, table: Mapping[str, float], where: str) -> np.ndarray:
-        """Return the value of each joint (D,) from a table of joint-name pattern -> value.
+    @property
+    def without_wheels(self) -> tuple[int, ...]:
+        """Indices of the joints that are no wheels: those whose angles have a meaning."""
+        return tuple(int(i) for i in np.flatnonzero(~self.wheels))
+
+    def each(self, value: Any, where: str) -> np.ndarray:
+        """Return a value for each joint, (D,): those of a pattern table, or the same for all.
 
         Raises:
             ConfigError: a pattern matches no joint, or no pattern matches a joint.
         """
-        return match_values(table, self.joint_names, where)
+        table = isinstance(value, Mapping)
+        return match_values(value, self.joint_names, where) if table else np.full(self.num_dof, value)
 
     def with_armature(self, armature: np.ndarray) -> "Robot":
         """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` is changed only by
@@ -161,34 +175,41 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     joints = [model.joint(i) for i in driven_joints(model, undriven)]
     names = tuple(joint.name for joint in joints)
     default = match_values(file.default_joint_angles, names, f"{path}: default_joint_angles")
+    limits = np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float)
+    for name, angle, (low, high) in zip(names, default, limits, strict=True):
+        if not low - SLACK <= angle <= high + SLACK:
+            told = f"{angle:g} rad for '{name}' is outside its range, {low:g} to {high:g} rad"
+            raise ConfigError(f"{path}: default_joint_angles: {told}")
     numbers = [joint.id for joint in joints]
     passive = PassiveJoints.of(model, numbers, undriven) if undriven else None
     shapes = Shapes.of(model, file.feet, f"{path}: feet")
     foot_ids = [model.geom(name).id for foot in shapes.feet_shapes for name in foot]
     qpos = default_qpos(model, numbers, default, passive, f"{path}: default_joint_angles")
     height, torque_limits = standing_height(model, file.base, qpos), model.actuator_forcerange[:, 1].copy()
-    if file.stiffness or file.damping:
-        stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
-        damping = match_values(file.damping, names, f"{path}: damping")
-    else:
-        stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height)
+    wheels = np.isin(np.arange(len(names)), match_names(file.wheels, names, f"{path}: wheels"))
     if file.velocity_limit:
         velocity_limits = match_values(file.velocity_limit, names, f"{path}: velocity_limit")
     else:
         velocity_limits = np.full(len(names), VELOCITY_LIMIT)
+    if file.stiffness or file.damping:
+        stiffness = match_values(file.stiffness, names, f"{path}: stiffness")
+        damping = match_values(file.damping, names, f"{path}: damping")
+    else:
+        stiffness, damping = gains(model, qpos, numbers, foot_ids, torque_limits, height, wheels * velocity_limits)
     return Robot(
         name=folder.name,
         folder=folder,
         file=file,
         joint_names=names,
         default_dof_pos=default,
-        dof_pos_limits=np.array([j.range if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in joints], dtype=float),
+        dof_pos_limits=limits,
         dof_vel_limits=velocity_limits,
         torque_limits=torque_limits,
         stiffness=stiffness,
         damping=damping,
         armature=model.dof_armature[[int(joint.dofadr[0]) for joint in joints]],
         inertia=inertia_in_air(model, qpos, numbers),
+        wheels=wheels,
         swings=swinging_joints(model, qpos, numbers, foot_ids),
         height=height,
         qpos_columns=tuple(int(joint.qposadr[0]) for joint in joints),
@@ -204,7 +225,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         termination_indices=shapes.contacts(file.terminate_after_contacts_on, f"{path}: terminate_after_contacts_on"),
         mass=float(model.body_mass.sum()),
         base_mass=base_mass(model, file.base),
-        adaptations=adaptations(folder / file.model),
+        adaptations=(*adaptations(folder / file.model), *aimless_shapes(model)),
         mirror=Mirror.of(model, numbers, shapes.feet_shapes, passive.numbers if passive else ()),
     )
 

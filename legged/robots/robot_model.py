@@ -105,6 +105,16 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
         raise ConfigError(f"{where}: base: body '{base}' has no mass")
 
 
+def aimless_shapes(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return a line if collision bits keep shapes apart from a ground with MuJoCo's default bits or with those of the task's
+    own; else nothing. The task gives all collision shapes bits that meet the ground.
+    """
+    touched, meets = model.geom_contype | model.geom_conaffinity, (model.geom_contype & 1) | (model.geom_conaffinity & 3)
+    names = [model.geom(int(i)).name for i in np.flatnonzero((touched != 0) & (meets == 0))]
+    said = "shapes whose collision bits would not meet the ground meet it all the same"
+    return (f"{said}: {', '.join(names)[:200]}",) if names else ()
+
+
 def base_mass(model: mujoco.MjModel, base: str) -> float:
     """Return the mass of the floating body [kg]."""
     return float(model.body(base).mass[0])

@@ -39,6 +39,9 @@ def leaves(data: dict, prefix: str = "") -> set[str]:
     return found
 
 
+LAW = "one of `P`, `V`, `T`"
+
+
 def test_every_field_of_a_configuration_is_there():
     values = {path for path, text in FIELDS.items() if not text.is_section}
     assert values == leaves(to_dict(LeggedConfig())) - {"task"}
@@ -56,7 +59,7 @@ def test_every_field_has_a_meaning_and_a_default_that_is_accepted():
     [
         ("sim.dt", ("a number", 0.005, "s", "at least 1e-05, at most 0.1")),
         ("env.num_envs", ("a whole number", 4096, "", "1 to 1048576")),
-        ("control.control_type", ("one of `P`, `V`, `T`", "P", "", "")),
+        ("control.control_type", (f"{LAW} or a map: {LAW} for each name", "P", "", "")),
         ("control.action_scale", ("a number or a map: a number for each name", 0.5, "rad", "above 0, at most 1e+06")),
         ("domain_rand.added_mass_range", ("[low, high]: 2 numbers", [-5.0, 5.0], "kg", "at most 10000 in size")),
         ("evaluation.yaw", ("a list of 3 numbers", [-1.0, 1.0, 0.5], "rad/s", "at most 20 in size")),

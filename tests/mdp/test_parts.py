@@ -296,7 +296,7 @@ def test_a_reset_forgets_the_swing_of_the_masked_robots_only():
 # ---- control ---------------------------------------------------------------------------------------------------------
 
 
-def control(kind: str) -> Control:
+def control(kind: str | dict[str, str]) -> Control:
     """ANYmal C with gains 10 / 2, 20 / 3 and 30 / 4 for HAA, HFE and KFE, two robots, 5 ms."""
     cfg = LeggedControlConfig(
         control_type=kind,
@@ -340,6 +340,15 @@ def test_torque_control_is_the_scaled_action():
     law = control("T")
     law.set_actions(rows(1.0, -3.0, 20.0))
     assert law.compute(rows(1, 1, 1), rows(1, 1, 1))[1, :3].tolist() == [0.5, -1.5, 10.0]
+
+
+def test_each_joint_may_have_its_own_law():
+    law = control({"HAA": "P", "HFE": "V", "KFE": "T"})
+    law.set_actions(rows(1.0, 2.0, -3.0))
+    torques = law.compute(rows(0.1, 9.0, 9.0), rows(1.0, 0.1, 9.0))
+    # 10 (0.5 - 0.1) - 2 * 1; 20 (1 - 0.1) - 3 * 0.1 / 0.005; -1.5. Action 0 of other legs: default angles of HFE count not.
+    assert torques[0, :3].tolist() == pytest.approx([2.0, 18 - 60, -1.5], abs=1e-4)
+    assert torques[0, 9:].tolist() == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("kind", ["P", "V", "T"])

@@ -47,6 +47,6 @@ def test_a_robot_with_a_foot_of_mesh_stands_on_a_terrain(robot, tmp_path):
         roll(physics, states.dof_pos, 20)
         forces.append(physics.robot_state.contact_forces)
     assert said[0] == ()
-    assert "1 collision meshes become the primitives that MuJoCo fits to their bounds: 1 sphere" in said[1]
+    assert "1 collision meshes become primitives around them: 1 sphere" in said[1]
     assert (forces[0][0, :, 2] > 50.0).sum() == 4
     torch.testing.assert_close(forces[1], forces[0], atol=1.0, rtol=0.01)

@@ -1,6 +1,7 @@
 """Data sheets of the robots under resources/robots, to compare their models with: numbers of their public descriptions."""
 
 from dataclasses import dataclass, field
+from math import inf
 
 Point = tuple[float, float, float]
 
@@ -76,6 +77,33 @@ FACTS = {
         ),
         armature={"joint": 0.01},
         standing=0.273,
+    ),
+    "go2w": Facts(
+        mass=19.523,
+        centre=(-0.002648, 0.0, -0.090829),
+        base_inertia=(0.0245024, 0.0982429, 0.1071627),
+        joints=legs("FL FR RL RR", "{}_hip_joint {}_thigh_joint {}_calf_joint {}_wheel_joint"),
+        effort={"hip": 23.7, "thigh": 23.7, "calf": 35.55, "wheel": 23.7},
+        speed={"hip": 30.1, "thigh": 30.1, "calf": 20.07, "wheel": 30.1},
+        ranges={
+            "hip": (-1.0472, 1.0472),
+            "FL_thigh": (-1.5708, 3.4907),
+            "FR_thigh": (-1.5708, 3.4907),
+            "RL_thigh": (-0.5236, 4.5379),
+            "RR_thigh": (-0.5236, 4.5379),
+            "wheel": (-inf, inf),
+            "calf": (-2.7227, -0.83776),
+        },
+        feet=mirrored(
+            {
+                "FL_wheel": ((0.186454, 0.202, -0.321559), (0.1934, 0.202, -0.4394)),
+                "RL_wheel": ((-0.200346, 0.202, -0.321559), (-0.1934, 0.202, -0.4394)),
+            },
+            {"FL_wheel": "FR_wheel", "RL_wheel": "RR_wheel"},
+        ),
+        armature={"hip": 0.01, "thigh": 0.01, "calf": 0.01, "wheel": 0.005},
+        standing=0.396,
+        gains=(70.0, 2.0),
     ),
     "g1": Facts(
         mass=33.341142,

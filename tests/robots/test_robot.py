@@ -265,6 +265,8 @@ def test_misspelt_robot_is_an_error_that_suggests_the_right_name():
         ("model: anymal_c.xml", "model: [a]", "model: expected text"),
         ("model: anymal_c.xml", f"model: {'x' * 5000}", "model: there is no file"),
         ("model: anymal_c.xml", "model: robot.yaml", "MuJoCo refuses it"),
+        ("H_KFE: 0.8", "H_KFE: 12", "default_joint_angles: 12 rad for"),
+        ("base: base", "wheels: [tyre]\nbase: base", "wheels: pattern 'tyre' matches nothing"),
         ("base: base", "base: world", "base: the free joint is on 'base', not on 'world'"),
         ("base: base", "base: [base]", "base: expected text"),
         ("base: base", "base: base\nbase: base", "key 'base' is given twice"),
@@ -275,6 +277,13 @@ def test_mistake_in_robot_yaml_is_an_error_that_names_file_and_field(folder, old
     text = refused(folder)
     assert str(folder / "robot.yaml") in text
     assert message in text
+
+
+def test_collision_bits_that_meet_no_ground_have_a_line(folder):
+    assert not load_robot(str(folder)).adaptations
+    edit(folder / "anymal_c.xml", 'contype="1" conaffinity="2"', 'contype="4" conaffinity="8"')
+    (line,) = load_robot(str(folder)).adaptations
+    assert line.startswith("shapes whose collision bits would not meet the ground meet it all the same: base")
 
 
 @pytest.mark.parametrize(

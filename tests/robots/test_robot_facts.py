@@ -95,7 +95,7 @@ def test_left_and_right_are_mirror_images(robot, model):
         np.testing.assert_array_equal(limit[partners], limit)
     low, high = robot.dof_pos_limits.T
     np.testing.assert_allclose(np.where(signs > 0, low[partners], -high[partners]), low, atol=1e-9)
-    angles = np.random.default_rng(0).uniform(low, high)
+    angles = np.random.default_rng(0).uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi))
     here, there = posed(model, robot, angles), posed(model, robot, angles[partners] * signs)
     for shapes, others in zip(robot.feet_shapes, (robot.feet_shapes[i] for i in mirror.feet), strict=True):
         place = np.mean([here.geom(name).xpos for name in shapes], axis=0)
@@ -113,7 +113,7 @@ def test_drawn_shapes_neither_collide_nor_weigh(robot):
     shapes = [model.geom(name).id for name in robot.shape_names]
     assert (model.geom_group[shapes] == 3).all()
     assert (model.geom_priority[shapes] == 1).all()
-    kinds = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_BOX)}
+    kinds = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind}")) for kind in ("SPHERE", "CAPSULE", "CYLINDER", "BOX")}
     assert set(model.geom_type[shapes]) <= kinds  # all that the terrain's own collider knows
 
 

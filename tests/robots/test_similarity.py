@@ -120,7 +120,7 @@ def test_p_gains_of_known_robots_are_those_of_their_makers_within_a_factor_of_tw
         qpos[7:] = robot.default_dof_pos
         feet = [model.geom(foot).id for foot in robot.feet_names]
         p, d = gains(model, qpos, joints, feet, robot.torque_limits, size_of(name).height)
-        own_p, own_d = (robot.gains(table, name) for table in (robot.file.stiffness, robot.file.damping))
+        own_p, own_d = (robot.each(table, name) for table in (robot.file.stiffness, robot.file.damping))
         assert (np.abs(np.log(p / own_p)) < np.log(2.0)).all()
         assert (np.abs(np.log(d / own_d)) < np.log(most)).all()
 

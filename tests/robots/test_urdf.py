@@ -12,7 +12,7 @@ from legged.robots.importing.legs import Poser
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.repair import repair
-from legged.robots.importing.shapes import fit_meshes, name_shapes
+from legged.robots.importing.shapes import count_fitted, fit_meshes, name_shapes
 from legged.robots.importing.tree import Tree
 from legged.robots.importing.urdf import read_urdf
 
@@ -31,6 +31,7 @@ def read(tmp_path):
         tree = read_urdf(path, **how)
         fit_meshes(tree)
         repair(tree)
+        count_fitted(tree)
         name_shapes(tree)
         return tree
 

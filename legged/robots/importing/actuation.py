@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
-from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, mass_matrix, standing_torques
+from legged.robots.gains import TIME_STEP, VELOCITY_LIMIT, gains, inertia_in_air, mass_matrix, standing_torques
 from legged.robots.importing.legs import Leg, Poser
 from legged.robots.importing.tree import Tree
 
@@ -42,32 +42,65 @@ def speed_limits(tree: Tree) -> dict[str, float]:
     return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in driven}
 
 
-def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return P and D gains [N m/rad], [N m s/rad] by hinge, from the file's position actuators.
+def give_rotors(tree: Tree, angles: dict[str, float]) -> None:
+    """Give the wheels that are too light for a gain on their speed a rotor with the inertia that they lack, in the pose at
+    `angles` [rad].
+    """
+    wheels = [hinge for hinge in tree.hinges if hinge.rolls and hinge.driven]
+    poser = Poser(tree)
+    own = inertia_in_air(poser.model, poser.pose(angles).qpos, [int(poser.model.joint(hinge.name).id) for hinge in wheels])
+    for hinge, inertia in zip(wheels, own, strict=True):
+        missing = TIME_STEP * (hinge.effort or 0.0) / (hinge.velocity or VELOCITY_LIMIT) - float(inertia)
+        if missing > 0.0:
+            hinge.passive["armature"] = round(hinge.passive.get("armature", 0.0) + 1.01 * missing, 6)
+            tree.say(
+                "guess: wheels that are too light for a motor of that torque and speed have rotors",
+                f"{hinge.name} {hinge.passive['armature']:.3g} kg m^2",
+            )
+
+
+def rule_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str], height: float) -> tuple[dict[str, float], ...]:
+    """Return the rule's P and D gains by hinge, as for a robot.yaml without gains: in the pose at `angles` [rad], with the
+    base at `height` [m] on the shapes `feet`. Those of wheels are gains on their speed [N m s/rad], and 0.
+    """
+    driven = [hinge for hinge in tree.hinges if hinge.driven]
+    poser = Poser(tree)
+    model, qpos = poser.model, poser.pose(angles).qpos.copy()
+    joints, shapes = [int(model.joint(hinge.name).id) for hinge in driven], [int(model.geom(name).id) for name in feet]
+    effort = np.array([hinge.effort or 0.0 for hinge in driven])
+    rolling = np.array([(hinge.velocity or VELOCITY_LIMIT) * hinge.rolls for hinge in driven])
+    both = gains(model, qpos, joints, shapes, effort, height, rolling)
+    return tuple(dict(zip((hinge.name for hinge in driven), values.tolist(), strict=True)) for values in both)
+
+
+def take_gains(
+    tree: Tree, angles: dict[str, float], feet: Sequence[str], height: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return P and D gains [N m/rad], [N m s/rad] by hinge, from the file's position actuators, and from the rule for hinges
+    whose actuators have none. Those of wheels are as `rule_gains` returns them.
 
     For a hinge whose actuator has no D gain, the damping of the joint becomes the D gain and is removed from the joint. The
     tables are empty if the file has no gains, if nothing is damped, or if the gains would not hold the robot up on the shapes
-    `feet` in the pose at `angles` [rad].
+    `feet` in the pose at `angles` [rad], with the base at `height` [m].
     """
-    driven = [hinge for hinge in tree.hinges if hinge.driven]
-    stated = [hinge for hinge in driven if hinge.stiffness]
+    stated = [hinge for hinge in tree.hinges if hinge.driven and hinge.stiffness and not hinge.rolls]
     if not stated:
         return {}, {}
-    if len(stated) < len(driven):
-        for hinge in driven:
-            if not hinge.stiffness:
-                tree.say("gains of the file are left out, because these joints have none", hinge.name)
-        return {}, {}
-    stiffness = {hinge.name: float(hinge.stiffness or 0.0) for hinge in driven}
-    damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in driven}
+    damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in stated}
     if not any(damping.values()):  # without damping the motion is on the edge of instability, and rounding errors decide
         tree.say("gains of the file's position actuators are left out: neither actuators nor joints have any damping")
         return {}, {}
-    growth = _growth(tree, angles, stiffness, damping)
-    if growth > 1.0:
+    p, d = rule_gains(tree, angles, feet, height)
+    stiffness = p | {hinge.name: float(hinge.stiffness or 0.0) for hinge in stated}
+    damping = d | damping
+    for hinge in tree.hinges:
+        if hinge.rolls and hinge.driven and hinge.damping and not hinge.stiffness:  # the file has a velocity actuator
+            stiffness[hinge.name] = min(hinge.damping, stiffness[hinge.name])
+    grows = growth(tree, angles, stiffness, damping)
+    if grows > 1.0:
         tree.say(
             f"gains of the file's position actuators are left out: at steps of {TIME_STEP * 1000:g} ms an explicit law with"
-            f" them makes deviations grow by {growth:.3g} a step"
+            f" them makes deviations grow by {grows:.3g} a step"
         )
         return {}, {}
     sags = _sags(tree, angles, stiffness, feet)
@@ -78,16 +111,20 @@ def take_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str]) -> tup
             f" {sags[worst]:.2g} rad"
         )
         return {}, {}
-    for hinge in driven:
+    for hinge in stated:
         if not hinge.damping and "damping" in hinge.passive:
             del hinge.passive["damping"]
             tree.say("damping of joints whose actuators have none is their D gain instead", hinge.name)
     tree.say("gains are those of the file's position actuators")
+    for hinge in tree.hinges:
+        if hinge.driven and hinge not in stated:
+            tree.say("guess: gains of joints without a position actuator are a rule's", hinge.name)
     return stiffness, damping
 
 
 def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], feet: Sequence[str]) -> dict[str, float]:
-    """Return the deflection of each joint under the robot's weight [rad], with the base level on its feet."""
+    """Return the deflection of each joint but wheels under the robot's weight [rad], with the base level on its feet."""
+    stiffness = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and not hinge.rolls}
     poser = Poser(tree)
     data = poser.pose(angles)
     shapes = [int(poser.model.geom(name).id) for name in feet]
@@ -95,10 +132,12 @@ def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], fee
     return {name: abs(float(torque)) / gain for (name, gain), torque in zip(stiffness.items(), torques, strict=True)}
 
 
-def _growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
+def growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
     """Return the largest factor by which a deviation grows in a step of semi-implicit Euler with explicit torques -K q - D v,
-    for a free base and the pose at `angles`. The damping and armature of the joints count.
+    for a free base and the pose at `angles`. The damping and armature of the joints count. K of a wheel acts on its speed.
     """
+    rolls = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and hinge.rolls}
+    stiffness, damping = stiffness | dict.fromkeys(rolls, 0.0), damping | rolls
     poser = Poser(tree)
     data = poser.pose(angles)
     mujoco.mj_forward(poser.model, data)

@@ -10,9 +10,11 @@ import mujoco
 from legged.errors import ConfigError
 from legged.robots.importing.infer import read_robot
 from legged.robots.importing.mjcf import drop_visual_meshes
+from legged.robots.importing.mjcf_source import read_spec
 from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.repair import repair
-from legged.robots.importing.shapes import fit_meshes, name_shapes
+from legged.robots.importing.shapes import count_fitted, fit_meshes, name_shapes
+from legged.robots.importing.wheels import find_wheels
 
 URDF = ".urdf"
 
@@ -29,7 +31,7 @@ def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
         Exception: MuJoCo refuses the file; its errors have no class of their own.
     """
     if path.suffix.lower() != URDF:
-        spec = mujoco.MjSpec.from_file(str(path))
+        spec, _ = read_spec(path)
         if is_plain(spec):
             if not drawn:
                 drop_visual_meshes(spec, path)
@@ -62,6 +64,8 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tup
         for link in tree.links:
             link.shapes = [shape for shape in link.shapes if shape.collides]
     repair(tree)
+    find_wheels(tree)
+    count_fitted(tree)
     name_shapes(tree)
     files: dict[str, Path] = {}
     for i, shape in enumerate(shape for link in tree.links for shape in link.shapes if not shape.collides):
@@ -76,7 +80,7 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tup
 
 def is_plain_file(path: Path) -> bool:
     """Return True if a robot's file is used unchanged."""
-    return path.suffix.lower() != URDF and is_plain(mujoco.MjSpec.from_file(str(path)))
+    return path.suffix.lower() != URDF and is_plain(read_spec(path)[0])
 
 
 def is_plain(spec: mujoco.MjSpec) -> bool:

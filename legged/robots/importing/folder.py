@@ -1,9 +1,11 @@
 """Robot folders written from a Tree: MJCF, meshes, robot.yaml, PROVENANCE.md, and a task for training."""
 
+import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from legged.config.yaml_files import dump
 from legged.process.paths import make_folder, write_text
@@ -12,6 +14,9 @@ from legged.robots.importing.mjcf_writer import mjcf_of
 from legged.robots.importing.repair import plain
 from legged.robots.importing.shapes import free_name
 from legged.robots.importing.tree import Mesh, Tree
+
+ACTION_SCALE = 0.5
+"""Scale of the actions of joints that are no wheels, if wheels have another one [rad]."""
 
 
 @dataclass
@@ -34,11 +39,13 @@ class Guesses:
     damping: dict[str, float]
     velocity: dict[str, float]
     legs: int
+    wheels: dict[str, float] = field(default_factory=dict)
+    """Hinges of wheels -> scale of their actions [rad/s]."""
 
 
-def called(legs: int) -> str:
-    """Return the word for a robot with so many legs."""
-    return {2: "biped", 4: "quadruped"}.get(legs, f"robot with {legs} legs")
+def called(legs: int, wheels: bool = False) -> str:
+    """Return the words for a robot with so many legs, with or without wheels."""
+    return {2: "biped", 4: "quadruped"}.get(legs, f"robot with {legs} legs") + (" on wheels" if wheels else "")
 
 
 def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licence: str) -> float:
@@ -91,7 +98,7 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
     lines = [
         f"# {tree.name}: how the task uses {tree.name}.xml. Written by legged robot add; sources: PROVENANCE.md.",
         "# Lines marked 'guess' were not in the file: look at them. Patterns are parts of names; the longest match wins.",
-        *(f"# {line}" for line in tree.said),
+        *(f"# {' '.join(line.split())}" for line in tree.said),
         f"model: {_name(f'{tree.name}.xml')}",
         f"base: {_name(g.base)}",
         f"spawn_height: {g.spawn_height:g}  # m; guess: the lowest point of the default pose, and a little more",
@@ -104,6 +111,8 @@ def robot_yaml(tree: Tree, guesses: Guesses) -> str:
         lines += _table("damping", g.damping, "N m s/rad")
     else:
         lines.append("# stiffness and damping are not in the file: a rule chooses them by the inertia that a joint sees")
+    if g.wheels:
+        lines.append(f"wheels: {_list(list(g.wheels))}  # guess: round shapes on hinges without limits")
     if g.velocity:
         lines += _table("velocity_limit", g.velocity, "rad/s; torque limits are the motors' forcerange in the model")
     lines += [
@@ -118,7 +127,7 @@ def _table(key: str, values: dict[str, float], unit: str) -> list[str]:
     return [f"{key}:  # {unit}", *(f"  {_name(name)}: {value:.6g}" for name, value in _compact(values).items())]
 
 
-def _compact(values: dict[str, float]) -> dict[str, float]:
+def _compact(values: dict[str, Any]) -> dict[str, Any]:
     """Return a table with shorter patterns: names without their first part, if the table then gives all joints the same
     values.
     """
@@ -133,7 +142,13 @@ def _compact(values: dict[str, float]) -> dict[str, float]:
 
 def _name(text: str) -> str:
     """Return a text as YAML, quoted if it would not be read as text otherwise."""
-    return dump(text, default_flow_style=True, width=10_000, allow_unicode=True).split("\n", 1)[0]
+    if "\n" in text:
+        return json.dumps(text)
+    return dump([text], default_flow_style=True, width=10_000, allow_unicode=True).strip()[1:-1]
+
+
+def _map(values: dict[str, Any]) -> str:
+    return "{" + ", ".join(f"{_name(name)}: {value}" for name, value in _compact(values).items()) + "}"
 
 
 def _list(names: Sequence[str]) -> str:
@@ -158,13 +173,18 @@ def _provenance(tree: Tree, source: str, licence: str) -> str:
     )
 
 
-def task_yaml(name: str, robot: str, extends: str, symmetric: bool) -> str:
+def task_yaml(name: str, robot: str, extends: str, symmetric: bool, guesses: Guesses) -> str:
     """Return the text of a task on flat ground; `robot` is a name, or a path relative to the task's file."""
     lines = [
         f"# {name} follows velocity commands on flat ground. Written by legged robot add.",
         f"extends: {_name(extends)}",
         f"robot: {_name(robot)}",
     ]
+    if guesses.wheels:
+        laws = {name: "V" if name in guesses.wheels else "P" for name in guesses.angles}
+        scales = {name: guesses.wheels.get(name, ACTION_SCALE) for name in guesses.angles}
+        lines += ["# Actions are angles of joints [rad], and speeds of wheels [rad/s].", "control:"]
+        lines += [f"  {key}: {_map(table)}" for key, table in (("control_type", laws), ("action_scale", scales))]
     if not symmetric:
         lines += ["# Its left side is not the mirror image of its right one.", "train: {algorithm: {symmetry: false}}"]
     return "\n".join([*lines, ""])

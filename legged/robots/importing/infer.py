@@ -10,17 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from legged.errors import ConfigError
-from legged.robots.importing.actuation import guess_efforts, speed_limits, take_gains
+from legged.robots.importing.actuation import GRAVITY, give_rotors, guess_efforts, rule_gains, speed_limits, take_gains
 from legged.robots.importing.folder import Guesses, called
 from legged.robots.importing.inverse_kinematics import GOOD, standing_angles
 from legged.robots.importing.legs import Leg, Poser, face_forward, find_legs
+from legged.robots.importing.meshes import check_length, vertices
 from legged.robots.importing.mjcf import read_mjcf
 from legged.robots.importing.mjcf_writer import model_of
 from legged.robots.importing.repair import repair
-from legged.robots.importing.shapes import fit_meshes, free_name, give_trunk, name_shapes
+from legged.robots.importing.shapes import count_fitted, fit_meshes, free_name, give_trunk, name_shapes
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.importing.urdf import read_urdf
-from legged.robots.stance import standing_height
+from legged.robots.importing.wheels import find_wheels
+from legged.robots.stance import lowest_point, standing_height
 
 LIGHT = 0.005
 """Fingers that move a smaller share of the robot's mass are held."""
@@ -34,6 +36,10 @@ WIDEST = 0.8
 """Largest half length of a guessed trunk, as a share of the distance from the base to the farthest foot."""
 LOST_FOOT = 0.25
 """Largest distance of a foot from its place in a stance, as a share of the leg's length; beyond it the link is not a foot."""
+LEVEL = 0.01
+"""Largest height of the lowest point of a foot above that of its leg, as a share of the leg's depth below the base."""
+ANKLE_HEIGHT = 0.3
+"""Largest height of the hinge of a sole above the ground, as a share of the height of the standing base."""
 LOST = 1e-6
 """Largest share of a robot's mass that rounding may lose."""
 
@@ -49,7 +55,10 @@ def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tr
     if path.suffix.lower() in (".xml", ".mjcf"):
         head = path.read_bytes()[:20_000]
         return read_urdf(path, roots, drawn) if b"<robot" in head and b"<mujoco" not in head else read_mjcf(path, drawn)
-    raise ConfigError(f"{path}: expected a URDF (.urdf) or an MJCF file (.xml)")
+    if path.suffix.lower() == ".xacro":
+        plain = f"{path.name.split('.')[0]}.plain.urdf"
+        raise ConfigError(f"{path}: is a xacro file; write the URDF first: xacro {path.name} > {plain}")
+    raise ConfigError(f"{path}: expected a URDF (.urdf) or an MJCF file (.xml, .mjcf)")
 
 
 def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] | None = None) -> Guesses:
@@ -61,26 +70,36 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
     """
     fit_meshes(tree)
     repair(tree, hold, LIGHT)
+    find_wheels(tree)
     face_forward(tree)
     legs = find_legs(tree)
     if not any(shape.collides for i in _trunk(tree, legs) for shape in tree.links[i].shapes):
         give_trunk(tree, WIDEST * _reach(tree, legs))
     name_shapes(tree)
-    _name_feet(tree, legs)
     _name_passive(tree, legs)
-    _draw_what_is_bare(tree)
     angles, origin = _default_pose(tree, legs)
+    if _stand_on_all(tree, legs, angles):
+        angles, origin = _default_pose(tree, legs)
+    _name_feet(tree, legs)
+    _draw_what_is_bare(tree)
+    for shape in (shape for link in tree.links for shape in link.shapes):
+        check_length(tree.source, shape, vertices(shape.mesh) if shape.mesh is not None else None)
+    count_fitted(tree)
     poser = Poser(tree)
     height = standing_height(poser.model, tree.links[0].name, poser.pose(angles).qpos)
     guess_efforts(tree, legs, height)
-    if gains is None:
-        stiffness, damping = take_gains(tree, angles, [shape.name for leg in legs for shape in leg.feet])
-    else:
-        stiffness, damping = ({hinge.name: gain for hinge in tree.hinges if hinge.driven} for gain in gains)
-    _check_mass(tree)
+    give_rotors(tree, angles)
     feet = [shape.name for leg in legs for shape in leg.feet]
-    tree.say(f"guess: a {called(len(legs))} with feet", ", ".join(feet))
-    ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet))
+    if gains is None:
+        stiffness, damping = take_gains(tree, angles, feet, height)
+    else:
+        rules = rule_gains(tree, angles, feet, height)
+        given = [hinge.name for hinge in tree.hinges if hinge.driven and not hinge.rolls]
+        stiffness, damping = (rule | dict.fromkeys(given, gain) for rule, gain in zip(rules, gains, strict=True))
+    _check_mass(tree)
+    wheels = _wheels(tree, legs, height)
+    tree.say(f"guess: a {called(len(legs), bool(wheels))} with feet", ", ".join(feet))
+    ending, penalized = (_named_apart(tree, role) for role in _roles(tree, legs, feet, _soles(tree, legs, angles, height)))
     return Guesses(
         base=tree.links[0].name,
         spawn_height=round(ABOVE * height, 3),
@@ -94,7 +113,54 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
         damping=damping,
         velocity=speed_limits(tree),
         legs=len(legs),
+        wheels=wheels,
     )
+
+
+def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
+    """Return the hinges of the wheels that legs stand on, each with a scale of its actions [rad/s]: half the speed sqrt(g h)
+    of a robot that stands `height` [m] high.
+    """
+    found = {}
+    for leg in legs:
+        for hinge in (hinge for hinge in tree.links[leg.end].hinges if hinge.rolls and hinge.driven):
+            found[hinge.name] = float(f"{0.5 * np.sqrt(GRAVITY * height) / max(s.size[0] for s in leg.feet):.2g}")
+            tree.say("guess: wheels, which have a velocity law, and whose angles are not observed", hinge.name)
+    return found
+
+
+def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool:
+    """Make all shapes of a leg's last link feet that are as low as its lowest one in the pose at `angles` [rad]; return True
+    if a leg has more feet now.
+    """
+    poser = Poser(tree)
+    data = poser.pose(angles)
+    lowest = {shape.name: lowest_point(poser.model, data, int(poser.model.geom(shape.name).id)) for shape in tree.shapes}
+    more = False
+    for leg in legs:
+        shapes = [shape for shape in tree.links[leg.end].shapes if shape.collides]
+        ground = min(lowest[shape.name] for shape in shapes)
+        known = {shape.name for shape in leg.feet}
+        feet = [shape for shape in shapes if shape.name in known or lowest[shape.name] < ground * (1.0 - LEVEL)]
+        if len(feet) > len(leg.feet):
+            leg.touch(feet)
+            more = True
+    return more
+
+
+def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float) -> set[str]:
+    """Return the shapes that belong to a foot, whether they touch the ground or not: all of the foot's link, if it is a link
+    of its own in the file, or if its hinge is near the ground in the pose at `angles` [rad], with the base at `height` [m].
+    """
+    poser = Poser(tree)
+    data = poser.pose(angles)
+    found = set()
+    for leg in legs:
+        link = tree.links[leg.end]
+        low = data.xanchor[poser.model.joint(link.hinges[-1].name).id, 2] < (ANKLE_HEIGHT - 1.0) * height
+        own = {shape.link for shape in leg.feet if low or shape.link != link.name}
+        found |= {shape.name for shape in link.shapes if shape.collides and shape.link in own}
+    return found
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
@@ -152,12 +218,12 @@ def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
     return [name for name in names if name in kept]
 
 
-def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str], list[str]]:
+def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str], of_feet: set[str]) -> tuple[list[str], list[str]]:
     """Return two lists of shapes: those whose contact ends an episode, and those whose contact is penalised.
 
     The first list is the shapes of the base and of the links that carry arms and a head. The second is thighs, shanks and the
-    ends of arms. Hips are in neither, because they hardly touch the ground, and heels are in neither, because the robot
-    stands on them.
+    ends of arms. Hips are in neither, because they hardly touch the ground. The shapes `of_feet` and heels are in neither,
+    because the robot stands on them.
     """
     of_legs = {i for leg in legs for i in leg.links}
     # the second-last link of a leg: it has the heel if the leg ends in a toe
@@ -169,7 +235,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str]) -> tuple[list[str],
     found = []
     for links in (in_the_middle, limbs + ends):
         shapes = [shape for i in dict.fromkeys(links) for shape in tree.links[i].shapes if shape.collides]
-        found.append([shape.name for shape in shapes if shape.name not in soles.union(feet)])
+        found.append([shape.name for shape in shapes if shape.name not in soles.union(feet, of_feet)])
     ending, penalized = found
     return ending, penalized
 

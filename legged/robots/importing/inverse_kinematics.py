@@ -100,7 +100,7 @@ def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], floa
         cost = float(np.sum(errors(x) ** 2)) + _wrong_knees(poser, limbs, forward=biped)
         if cost < least - 1e-9:
             best, least = x, cost
-    found = {name: round(angle, 3) + 0.0 for name, angle in angles(best).items()}
+    found = {name: round(angle, 3) + 0.0 for name, angle in tree.followed(angles(best)).items()}
     poser.pose(found)
     miss = [_miss(poser, limb, ground) for limb in limbs]
     return found, max(miss)

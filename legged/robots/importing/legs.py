@@ -33,7 +33,7 @@ class Leg:
     links: list[int]
     """Links of the tree from the base's child to the foot."""
     hinges: list[str]
-    """Names of the hinges along the links."""
+    """Names of the hinges along the links, without that of a wheel at the end."""
     tip: Vector
     """(3,) lowest point of the leg, in the frame of its last link."""
     feet: list[Shape]
@@ -42,6 +42,10 @@ class Leg:
     @property
     def end(self) -> int:
         return self.links[-1]
+
+    def touch(self, shapes: list[Shape]) -> None:
+        """Make shapes of the last link the feet; their mean is the tip."""
+        self.feet, self.tip = shapes, np.mean([shape.pos for shape in shapes], axis=0)
 
 
 class Poser:
@@ -60,10 +64,10 @@ class Poser:
         self.ids = [int(self.model.body(link.name).id) for link in tree.links]
 
     def pose(self, angles: dict[str, float]) -> mujoco.MjData:
-        """Return MuJoCo's data at joint `angles` [rad]; hinges that are not named are at 0."""
+        """Return MuJoCo's data at joint `angles` [rad]; unnamed hinges are at 0, coupled ones follow others."""
         self.data.qpos[:] = 0.0
         self.data.qpos[3] = 1.0
-        for name, angle in angles.items():
+        for name, angle in self.tree.followed(angles).items():
             self.data.qpos[self.places[name]] = angle
         mujoco.mj_kinematics(self.model, self.data)
         return self.data
@@ -135,12 +139,12 @@ def find_legs(tree: Tree) -> list[Leg]:
         raise ConfigError(f"{tree.source}: {why}")
     legs = []
     for i in found:
-        hinges = [hinge.name for j in chains[i] for hinge in tree.links[j].hinges]
-        legs.append(Leg(chains[i], hinges, _tip(tree, i), []))
+        hinges = [hinge for j in chains[i] for hinge in tree.links[j].hinges]
+        bending = [hinge.name for hinge in hinges if not hinge.rolls] or [hinge.name for hinge in hinges]
+        legs.append(Leg(chains[i], bending, _tip(tree, i), []))
     for leg in legs:
         shapes = len(tree.links[leg.end].shapes)
-        leg.feet = _feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE)
-        leg.tip = np.mean([shape.pos for shape in leg.feet], axis=0) if leg.feet else leg.tip
+        leg.touch(_feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE))
         if len(tree.links[leg.end].shapes) == shapes:  # else the ball was added, and the rod is shortened
             _uncover(tree, leg)
     return legs
@@ -195,6 +199,8 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
     """Return the shapes of a leg's last link that touch the ground. A leg that ends in a rod gets a ball at its end."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
+    if any(hinge.rolls for hinge in link.hinges):
+        return shapes
     for i, shape in enumerate(link.shapes):
         if flat and shape.fits and _is_low(shape, leg, shapes):
             link.shapes[i] = refitted(shape, "box")  # robots with two feet stand on their soles

@@ -12,6 +12,7 @@ from urllib.parse import unquote
 import mujoco
 import numpy as np
 
+from legged.errors import ConfigError
 from legged.robots.importing.tree import Mesh, Shape, Vector, quat_product, rotate
 
 READ = (".stl", ".obj", ".msh")
@@ -22,6 +23,8 @@ ENOUGH_FACES = 50_000
 """Largest number of faces after a mesh with too many was simplified."""
 FINEST = 600
 """Number of cells along the longest side of a mesh at the first attempt to simplify it."""
+LONGEST = 3.0
+"""Longest mesh of a legged robot [m]; a longer one is in other units."""
 STL_HEADER, STL_FACE = 84, 50
 """Sizes of the header and of a face in a binary STL file [bytes]."""
 
@@ -52,7 +55,21 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     for option in options:
         if option.is_file():
             return option.resolve()
+    for option in options:
+        found = ignoring_case(option)
+        if found is not None:
+            return found.resolve()
     raise MeshMissing(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+
+
+def ignoring_case(path: Path) -> Path | None:
+    """Return the file or folder at `path`, in upper or lower case; None if it does not exist."""
+    if path.exists() or path.parent == path:
+        return path if path.is_file() or path.is_dir() else None
+    folder = ignoring_case(path.parent)
+    if folder is None or not folder.is_dir():
+        return None
+    return next((other for other in sorted(folder.iterdir()) if other.name.lower() == path.name.lower()), None)
 
 
 def find_by_name(name: str, folder: Path) -> Path:
@@ -159,13 +176,39 @@ def fitted(shape: Shape) -> Shape:
         MeshProblem: MuJoCo refuses the mesh.
     """
     assert shape.mesh is not None
-    found = _fits(shape.mesh)
+    found, points = _fits(shape.mesh)
     extent = found["box"][0]
     for kind, (size, pos, quat) in found.items():
         found[kind] = (size, shape.pos + rotate(shape.quat, pos), quat_product(shape.quat, quat))
     fair = [kind for kind in found if kind != "sphere" or extent.max() <= ROUND * extent.min()]
     best = min(fair, key=lambda kind: _volume(kind, found[kind][0]))
-    return refitted(Shape(best, *found[best], True, shape.link, shape.name, friction=shape.friction, fits=found), best)
+    points = shape.pos + rotate(shape.quat, points)
+    return Shape(best, *found[best], True, shape.link, shape.name, friction=shape.friction, fits=found, points=points)
+
+
+def check_length(source: Path, shape: Shape, points: Vector | None) -> None:
+    """Check that the mesh of a shape is not too long for a part of a legged robot, given its vertices (V, 3), and the file of
+    the robot for the error.
+
+    Raises:
+        ConfigError: it is too long.
+    """
+    length = 0.0 if points is None or not len(points) else float(np.ptp(points, axis=0).max())
+    if length > LONGEST:
+        name = shape.mesh.file.name if shape.mesh is not None and shape.mesh.file is not None else shape.name
+        raise ConfigError(
+            f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; one in millimetres needs"
+            ' scale="0.001 0.001 0.001"'
+        )
+
+
+def vertices(mesh: Mesh) -> Vector | None:
+    """Return the vertices (V, 3) of a mesh [m] if they are cheap to read, as those of a binary STL file."""
+    if mesh.file is None or mesh.file.suffix.lower() != ".stl":
+        return mesh.vertices
+    face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
+    content = mesh.file.read_bytes()[STL_HEADER:]
+    return np.frombuffer(content, face, len(content) // STL_FACE)["corners"].reshape(-1, 3) * mesh.scale
 
 
 def rounded(shape: Shape) -> Shape:
@@ -181,9 +224,9 @@ def refitted(shape: Shape, kind: str) -> Shape:
     return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())
 
 
-def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
+def _fits(mesh: Mesh) -> tuple[dict[str, tuple[Vector, Vector, Vector]], Vector]:
     """Return the primitives that MuJoCo fits to a mesh: kind -> size (3,), position (3,) and orientation (4,). A flat mesh
-    has no capsule.
+    has no capsule. The second value is the mesh's vertices (V, 3) [m].
     """
     found: dict[str, tuple[Vector, Vector, Vector]] = {}
     problem: Exception | None = None
@@ -200,13 +243,15 @@ def _fits(mesh: Mesh) -> dict[str, tuple[Vector, Vector, Vector]]:
                 added.uservert, added.userface = mesh.vertices.ravel(), mesh.faces.ravel()
             spec.worldbody.add_geom(name="fit", type=kind, meshname="mesh")
             try:
-                geom = spec.compile().geom("fit")
+                model = spec.compile()
             except Exception as error:  # MuJoCo's errors have no class of their own
                 problem = error
                 continue
+            geom = model.geom("fit")
             found[name] = (geom.size.copy(), geom.pos.copy(), geom.quat.copy())
+            points = rotate(model.mesh_quat[0], model.mesh_vert.astype(float)) + model.mesh_pos[0]
         if "box" in found:
-            return found
+            return found, points
     raise MeshProblem(f"mesh '{mesh.name}': MuJoCo refuses it: {' '.join(str(problem).split())}")
 
 

@@ -1,12 +1,15 @@
 """Reader of any MJCF into a Tree: scenes with floors and lights, unnamed shapes, any actuators, welded bodies."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
 from legged.errors import ConfigError
+from legged.robots.importing.dynamics import account_for
 from legged.robots.importing.mjcf_motors import read_motors
+from legged.robots.importing.mjcf_source import read_spec
 from legged.robots.importing.shapes import free_name
 from legged.robots.importing.tree import (
     IDENTITY,
@@ -41,32 +44,25 @@ def read_mjcf(path: Path, drawn: bool = True) -> Tree:
     Raises:
         ConfigError: MuJoCo refuses the file, or no body in it moves.
     """
-    return tree_of(spec_of(path), path, drawn)
+    spec, said = read_spec(path)
+    return tree_of(spec, path, drawn, said)
 
 
-def spec_of(path: Path) -> mujoco.MjSpec:
-    """Parse an MJCF file.
-
-    Raises:
-        ConfigError: MuJoCo refuses it.
-    """
-    try:
-        return mujoco.MjSpec.from_file(str(path))
-    except Exception as error:  # MuJoCo's errors have no class of their own
-        raise ConfigError(f"{path}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
-
-
-def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True) -> Tree:
-    """Return the heaviest robot in a spec, which is changed in place; `path` is the file that it was read from.
+def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True, said: Sequence[tuple[str, str]] = ()) -> Tree:
+    """Return the heaviest robot in a spec, which is changed in place; `path` is the file that it was read from. `said` are
+    lines about changes on the way, each with what it is about.
 
     Raises:
         ConfigError: MuJoCo refuses the spec, or no body in it moves.
     """
     tree = Tree(spec.modelname or path.stem, path, [], 0.0)
+    for line, about in said:
+        tree.say(line, about)
     model = _compiled(spec, path, tree, drawn)
     root = _root(model, path, tree)
     _read_links(model, root, tree, _meshes(spec, model, path), drawn)
     read_motors(model, tree)
+    account_for(model, tree)
     _read_loops(model, tree)
     _read_apart(model, tree)
     _read_home(model, tree, path)

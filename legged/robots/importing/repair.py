@@ -1,7 +1,7 @@
 """Repair of a Tree before it becomes a model: welded links are merged, impossible masses and inertias are corrected."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -42,8 +42,10 @@ def repair(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
         ConfigError: a pattern of `hold` matches no joint, or there is no mass.
     """
     _check_numbers(tree)
+    at = tree.followed({hinge.name: rest_angle(tree, hinge) for hinge in tree.hinges})
     _hold(tree, hold)
-    _hold_what_is_light(tree, light)
+    _hold_what_is_light(tree, light, at)
+    _hold_followers(tree, at)
     merge_welded(tree)
     if len(tree.links) == 1:
         raise ConfigError(f"{tree.source}: no joint is a hinge that moves a mass")
@@ -84,9 +86,9 @@ def fix(link: Link, hinge: Hinge, angle: float) -> None:
     link.hinges = [other for other in link.hinges if other is not hinge]
 
 
-def _hold_what_is_light(tree: Tree, light: float) -> None:
-    """Hold joints that move no mass, neither their own link's nor another's, and joints of fingers, which are recognised by
-    name and mass.
+def _hold_what_is_light(tree: Tree, light: float, at: Mapping[str, float]) -> None:
+    """Hold joints that move no mass, neither their own link's nor another's, joints of fingers, which are recognised by name
+    and mass, and light joints that mimic others, at the angles `at` [rad]. Without `light`, all that mimic others are held.
     """
     moved = [link.mass for link in tree.links]
     for i in reversed(range(1, len(tree.links))):
@@ -96,10 +98,24 @@ def _hold_what_is_light(tree: Tree, light: float) -> None:
             if moved[i] <= TINY:
                 tree.say("joints that move no mass are held", hinge.name)
                 fix(link, hinge, 0.0)
+            elif hinge.mimics and (light == 0.0 or moved[i] < light * moved[0]):
+                tree.say("joints that mimic others are held", f"{hinge.name} ({at[hinge.name]:.5g} rad)")
+                fix(link, hinge, at[hinge.name])
             elif moved[i] < light * moved[0] and FINGERS.search(f"{link.name} {hinge.name}"):
                 angle = rest_angle(tree, hinge)
                 tree.say("fingers and the like are held", f"{hinge.name} at {angle:.3g} rad")
                 fix(link, hinge, angle)
+
+
+def _hold_followers(tree: Tree, at: Mapping[str, float]) -> None:
+    """Hold the hinges without a motor that follow hinges which are held, at the angles `at` [rad]: nothing moves them."""
+    names = {hinge.name for hinge in tree.hinges}
+    coupled = [loop for loop in tree.loops if loop["tag"] == "joint" and "joint2" in loop]
+    followers = {loop["joint1"] for loop in coupled if loop["joint2"] not in names}
+    for link in tree.links:
+        for hinge in [hinge for hinge in link.hinges if hinge.name in followers and not hinge.driven]:
+            tree.say("joints that follow a held one are held too", f"{hinge.name} at {at[hinge.name]:.3g} rad")
+            fix(link, hinge, at[hinge.name])
 
 
 def rest_angle(tree: Tree, hinge: Hinge) -> float:

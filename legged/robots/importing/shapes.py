@@ -5,7 +5,7 @@ import re
 import mujoco
 import numpy as np
 
-from legged.robots.importing.meshes import MeshProblem, fitted
+from legged.robots.importing.meshes import MeshProblem, check_length, fitted
 from legged.robots.importing.tree import Shape, Tree
 from legged.robots.reserved_names import RESERVED
 
@@ -17,7 +17,6 @@ def fit_meshes(tree: Tree) -> None:
     """Replace the collision meshes of a tree by primitives, in place. If no shape collides, the visual shapes do."""
     if not tree.shapes:
         _let_the_drawn_collide(tree)
-    kinds: list[str] = []
     for link in tree.links:
         shapes: list[Shape] = []
         for shape in link.shapes:
@@ -26,13 +25,18 @@ def fit_meshes(tree: Tree) -> None:
                 continue
             try:
                 shapes.append(fitted(shape))
-                kinds.append(shapes[-1].kind)
+                check_length(tree.source, shape, shapes[-1].points)
             except MeshProblem as problem:
                 tree.say("collision meshes are left out", f"of {shape.link}, {problem}")
         link.shapes = shapes
+
+
+def count_fitted(tree: Tree) -> None:
+    """Report the primitives that have replaced collision meshes."""
+    kinds = [shape.kind for shape in tree.shapes if shape.points is not None]
     if kinds:
         counted = ", ".join(f"{kinds.count(kind)} {kind}" for kind in sorted(set(kinds)))
-        tree.say(f"{len(kinds)} collision meshes become the primitives that MuJoCo fits to their bounds: {counted}")
+        tree.say(f"{len(kinds)} collision meshes become primitives around them: {counted}")
 
 
 def _let_the_drawn_collide(tree: Tree) -> None:

@@ -1,5 +1,6 @@
 """A robot between files: links on hinges, with masses, shapes and motors, whatever format they were read from."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -43,10 +44,13 @@ class Shape:
     friction: Vector | None = None
     fits: dict[str, tuple[Vector, Vector, Vector]] = field(default_factory=dict)
     """Other primitives that fit the mesh: kind -> size, position and orientation."""
+    points: Vector | None = None
+    """(V, 3) vertices of the mesh that a collision shape was fitted to [m]."""
 
     def move(self, pos: Vector, quat: Vector) -> None:
         """Move the shape into another frame, in which its present frame is at `pos` (3,) [m], turned by `quat` (4,)."""
         self.pos, self.quat = pos + rotate(quat, self.pos), quat_product(quat, self.quat)
+        self.points = None if self.points is None else pos + rotate(quat, self.points)
         self.fits = {
             kind: (size, pos + rotate(quat, at), quat_product(quat, turned)) for kind, (size, at, turned) in self.fits.items()
         }
@@ -67,6 +71,10 @@ class Hinge:
     """Speed limit [rad/s]."""
     driven: bool = True
     """True if the hinge has a motor."""
+    mimics: bool = False
+    """True if a URDF lets the hinge follow another one."""
+    rolls: bool = False
+    """True if the hinge carries a wheel, which turns without limits."""
     stiffness: float | None = None
     """P gain of a position actuator [N m/rad]."""
     damping: float | None = None
@@ -124,6 +132,20 @@ class Tree:
     def said(self) -> list[str]:
         """Lines about changes, omissions and guesses."""
         return [f"{line}: {listed(names)}" if names else line for line, names in self._said.items()]
+
+    def couple(self, follower: str, leader: str, factors: Sequence[float]) -> None:
+        """Let a hinge follow another one: its angle is the polynomial with these `factors`, lowest power first [rad]."""
+        polynomial = " ".join(f"{factor:.15g}" for factor in (*factors, 0.0, 0.0, 0.0, 0.0)[:5])
+        self.loops.append({"tag": "joint", "joint1": follower, "joint2": leader, "polycoef": polynomial})
+
+    def followed(self, angles: Mapping[str, float]) -> dict[str, float]:
+        """Return joint angles [rad], those of coupled hinges as their leaders' angles demand."""
+        found = dict(angles)
+        for loop in self.loops:
+            if loop["tag"] == "joint" and "joint2" in loop:
+                polynomial = np.polynomial.Polynomial(vector_of(loop["polycoef"]))
+                found[loop["joint1"]] = float(polynomial(found.get(loop["joint2"], 0.0)))
+        return found
 
     def turn(self, quat: Vector) -> None:
         """Turn the robot in the frame of its base by `quat` (4,)."""

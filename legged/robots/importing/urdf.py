@@ -15,12 +15,14 @@ from legged.config.checks import shown
 from legged.errors import ConfigError, suggest
 from legged.robots.importing import meshes
 from legged.robots.importing.meshes import MeshMissing, MeshProblem
-from legged.robots.importing.tree import Hinge, Link, Shape, Tree, Vector, matrix, quat_about, quat_of_rpy, quat_product
+from legged.robots.importing.tree import Hinge, Link, Shape, Tree, Vector, matrix, quat_of_rpy
 
 MOST_TURNS = 1e3
 """Limits larger than this in both directions count as no limits [rad]."""
 HINGES = ("revolute", "continuous")
 NO_HINGES = {"prismatic": "slide", "planar": "slide in a plane", "floating": "float"}
+PARTS = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
+"""Elements of a joint that are read."""
 KINDS = (*HINGES, *NO_HINGES, "fixed")
 
 
@@ -33,6 +35,11 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
     """
     root = _parsed(path)
     tree = Tree(root.get("name") or path.stem, path, [], 0.0)
+    for kind in ("link", "joint"):
+        names = [element.get("name", "") for element in root.findall(kind)]
+        twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+        if twice is not None:
+            raise ConfigError(f"{path}: {kind} '{twice}' comes twice; each {kind} needs a name of its own")
     elements = {link.get("name", ""): link for link in root.findall("link")}
     joints = [_Joint(element, path, elements) for element in root.findall("joint")]
     top, above = _top(elements, joints, path)
@@ -58,7 +65,13 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
         missing = sorted(set(elements) - {link.name for link in tree.links})
         raise ConfigError(f"{path}: joints form a circle; not reached from '{top}': {', '.join(missing)[:200]}")
     tree.mass = sum(link.mass for link in tree.links)
+    leaders = {joint.name for joint in joints}
+    for loop in (loop for loop in tree.loops if loop["joint2"] not in leaders):
+        known = suggest(loop["joint2"], leaders, "joints")
+        raise ConfigError(f"{path}: joint '{loop['joint1']}': mimic: there is no joint '{loop['joint2']}'{known}")
+    _check_degrees(tree)
     _pass_over(tree, above)
+    _say_what_is_unknown(tree, root)
     return tree
 
 
@@ -73,8 +86,11 @@ def _parsed(path: Path) -> ET.Element:
         raise ConfigError(f"{path}: can't be read: {error}") from error
     if root.tag != "robot":
         raise ConfigError(f"{path}: expected a URDF with <robot> at the top, found <{root.tag}>")
-    if "xacro" in ET.tostring(root, encoding="unicode", short_empty_elements=True)[:20000] and root.find("link") is None:
-        raise ConfigError(f"{path}: is a xacro file without links; write the URDF first: xacro {path.name} > robot.urdf")
+    if any("ros.org/wiki/xacro" in str(element.tag) for element in root.iter()) or any(
+        "${" in value for element in root.iter() for value in element.attrib.values()
+    ):
+        plain = f"{path.name.split('.')[0]}.plain.urdf"
+        raise ConfigError(f"{path}: is a xacro file; write the URDF first: xacro {path.name} > {plain}")
     if root.find("link") is None:
         raise ConfigError(f"{path}: has no links")
     return root
@@ -113,6 +129,34 @@ def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
         if joint.kind == "fixed" and joint.parent != "world":
             what = f"guess: the base is link '{tree.links[0].name}', and empty links above it on fixed joints are passed over"
             tree.say(what, joint.parent)
+
+
+def _check_degrees(tree: Tree) -> None:
+    """Check that limits are in radians.
+
+    Raises:
+        ConfigError: a joint can't reach any angle within a turn of 0, or half of the joints turn more than twice.
+    """
+    limited = [hinge for hinge in tree.hinges if hinge.range is not None]
+    far = [h for h in limited if h.range and (min(h.range) > 2.0 * math.pi or max(h.range) < -2.0 * math.pi)]
+    wide = [h for h in limited if h.range and max(map(abs, h.range)) > 4.0 * math.pi]
+    if far or 2 * len(wide) > len(limited):
+        hinge = (far or wide)[0]
+        low, high = hinge.range or (0.0, 0.0)
+        raise ConfigError(
+            f"{tree.source}: joint '{hinge.name}': limits of {low:g} and {high:g} look like degrees; a URDF has radians"
+            f" ({math.radians(low):.4g} and {math.radians(high):.4g})"
+        )
+    for hinge in wide:
+        tree.say("limits of more than two turns; are they in degrees? A URDF has radians", f"{hinge.name} {hinge.range}")
+
+
+def _say_what_is_unknown(tree: Tree, root: ET.Element) -> None:
+    """Report the elements that are left out, of the robot and of its joints."""
+    left_out = [element.tag for element in root if element.tag not in ("link", "joint", "material")]
+    left_out += [part.tag for joint in root.findall("joint") for part in joint if part.tag not in PARTS]
+    for tag in dict.fromkeys(tag for tag in left_out if isinstance(tag, str)):
+        tree.say("elements that are left out", f"{left_out.count(tag)} <{tag}>")
 
 
 def _say_dont_collapse(tree: Tree, joints: list["_Joint"]) -> None:
@@ -156,13 +200,12 @@ class _Joint:
         if not np.linalg.norm(axis) > 1e-9:
             raise ConfigError(f"{self.path}: joint '{self.name}': axis: must have a length, got 0 0 0")
         axis = axis / np.linalg.norm(axis)
+        link.hinges = [self._hinge(axis, tree)]
         mimic = self.element.find("mimic")
         if mimic is not None:
-            at = _number(mimic, "offset", self.path, 0.0)
-            tree.say("joints that mimic others are held at their offsets", f"{self.name} ({at:g} rad)")
-            link.quat = quat_product(link.quat, quat_about(axis, at or 0.0))
-            return
-        link.hinges = [self._hinge(axis, tree)]
+            link.hinges[0].driven, link.hinges[0].mimics = False, True
+            factors = (_number(mimic, "offset", self.path, 0.0), _number(mimic, "multiplier", self.path, 1.0))
+            tree.couple(self.name, mimic.get("joint", ""), factors)
 
     def _hinge(self, axis: Vector, tree: Tree) -> Hinge:
         hinge = Hinge(self.name, axis)
@@ -174,6 +217,8 @@ class _Joint:
             hinge.velocity = velocity if velocity and 0.0 < velocity < 1e3 else None
         if self.kind == "revolute":
             low, high = (0.0 if limit is None else _number(limit, key, self.path, 0.0) for key in ("lower", "upper"))
+            if low > high:
+                raise ConfigError(f"{self.path}: joint '{self.name}': limit: lower {low:g} is above upper {high:g}")
             if low < high and not (low < -MOST_TURNS and high > MOST_TURNS):
                 hinge.range = (max(low, -MOST_TURNS), min(high, MOST_TURNS))
             else:
