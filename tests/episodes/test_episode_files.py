@@ -105,7 +105,7 @@ def replace_array(name: str, array: np.ndarray):
         (replace_array("torque", np.zeros((7, 4))), "torque: expected 8 rows of numbers, got shape"),
         (replace_array("torque", np.full((8, 4), "x")), "torque: expected 8 rows of numbers"),
         (replace_array("qvel", np.zeros((8, 3))), r"arrays\.qvel\.columns: expected names"),
-        (replace_array("episode_start", np.array([0, 9, 8])), "episode_start does not say"),
+        (replace_array("episode_start", np.array([0, 9, 8])), "episode_start does not hold"),
     ],
 )
 def test_damaged_episodes_are_refused(damage, words):

@@ -42,7 +42,7 @@ def test_a_gif_shows_all_in_real_time_and_is_made_smaller_until_it_is_small_enou
         assert image.size[0] < 64
         assert f"4 pictures of {image.size[0]} x {image.size[1]} pixels" in said
     monkeypatch.setattr(films, "MOST_BYTES", 100)
-    with pytest.raises(RunError, match=r"none.gif: would be larger than 0.0001 MB"):
+    with pytest.raises(RunError, match=r"none.gif: the GIF would be larger than 0.0001 MB"):
         write_film(pictures, Path("none.gif"))
     assert not Path("none.gif").exists()
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, TINY_TRAINING, kept_global_state, zero_actions
 
-from legged.cli import train
+from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.policies.description import describe
 from legged.registry import make_task, task_config
