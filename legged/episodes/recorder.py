@@ -41,7 +41,7 @@ LONGEST_CHUNK = 100
 
 @dataclass(frozen=True)
 class Wish:
-    """What the command line asks a recording to be."""
+    """Settings of a recording, from the command line."""
 
     episodes: int
     robots: int

@@ -1,4 +1,4 @@
-"""What all measurements of a policy share: the setting, the head of the result, and the count of lost contacts."""
+"""Common parts of all measurements of a policy: the setting, the head of the result, and the count of lost contacts."""
 
 import sys
 from collections.abc import Sequence

@@ -116,7 +116,7 @@ class PassiveJoints:
 
     def draw(self, default: np.ndarray, factor: tuple[float, float], count: int, seed: int, where: str) -> np.ndarray:
         """Return (count, nq) random poses with closed loops. The angles of driven joints are those of `default` (nq,) times
-        random numbers from `factor`. A pose is drawn again if its loops do not close or passive joints leave their ranges.
+        random numbers from `factor`. Another pose is drawn if its loops do not close or passive joints leave their ranges.
 
         Raises:
             ConfigError: too few poses are possible; `where` is the place of `factor` in the configuration.

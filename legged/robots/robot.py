@@ -58,7 +58,7 @@ class RobotFile:
 
 @dataclass(frozen=True)
 class Robot:
-    """What a task needs to know of a robot. It has D joints with a motor, in the order of the model, P passive hinges and
+    """Properties of a robot that a task uses. It has D joints with a motor, in the order of the model, P passive hinges and
     slides, S collision shapes, F feet and B contacts. "Joint" means a joint with a motor unless stated otherwise.
 
     A contact is a collision shape, or all shapes of a foot together, for which one contact force is computed.

@@ -62,7 +62,7 @@ class Shapes:
 
 def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence[str], where: str) -> tuple[int, ...]:
     """Return the indices, in ascending order, of the shapes that the patterns name. A pattern names all shapes whose names
-    contain it. If there are none, it names all shapes of the bodies whose names contain it.
+    contain it. If no name contains it, the pattern names all shapes of the bodies whose names contain it.
 
     Raises:
         ConfigError: a pattern is in no name; `where` is the place of the patterns.

@@ -63,7 +63,7 @@ class Code:
 
 @dataclass(frozen=True)
 class Record:
-    """What the folder of a run says about the run."""
+    """Contents of a run's folder."""
 
     folder: Path
     config: dict[str, Any]
