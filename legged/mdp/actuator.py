@@ -121,8 +121,6 @@ class Actuator:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
         self.decimation, self._kernels = cfg.decimation, kernels
-        self.middle = middle
-        """(D,), (N, D) or () target of action 0."""
         stall, fastest = map(tensor, motor_numbers(robot, actuator))
         self.curve = MotorCurve(torch.where(fastest.isfinite(), stall, torch.inf), fastest)
         coulomb, breakaway, viscous = map(tensor, friction_numbers(robot, actuator))
@@ -229,9 +227,9 @@ class Actuator:
             asked = asked - self.friction.torques(dof_vel)
         torch.clamp(asked, -effort, effort, out=out)
 
-    def reset(self, mask: Tensor) -> None:
-        """Reset the state of the robots in `mask` (N,), and draw their delay. With delay_varies, draw the delay of all
-        robots.
+    def reset(self, mask: Tensor, middle: Tensor) -> None:
+        """Reset the robots in `mask` (N,) to the target of action 0, `middle` (D,), (N, D) or (), and draw their delay. With
+        delay_varies, draw the delay of all robots.
         """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
@@ -241,7 +239,7 @@ class Actuator:
             else:
                 masked_set_(self.delay, mask, drawn)
         if self.longest:
-            torch.where(mask.view(1, -1, 1), self.middle, self.targets, out=self.targets)
+            torch.where(mask.view(1, -1, 1), middle, self.targets, out=self.targets)
         if self.network is not None:
             self.network.reset(mask)
 

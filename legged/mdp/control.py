@@ -177,8 +177,7 @@ class Control:
         if "V" in self._has:
             masked_set_(self._last_dof_vel, mask, 0.0)
         if self.actuator is not None:
-            self.actuator.middle = self._middle()  # encoder errors may have been drawn anew
-            self.actuator.reset(mask)
+            self.actuator.reset(mask, self._middle())
 
 
 def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> None:
