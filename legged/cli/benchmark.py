@@ -313,7 +313,8 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
 def _run(*arguments: str) -> dict[str, float]:
     """Run Python in an empty folder; return the end of each stage of a start, and of the process as `end` [s]."""
     with tempfile.TemporaryDirectory() as folder, tempfile.NamedTemporaryFile("r", encoding="utf-8") as file:
-        # The process must find this package, if it is not installed, and user-defined modules where this process did.
+        # The child process runs in another folder. With this process's import path it finds user-defined modules, and this
+        # package even if it is not installed.
         path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
         environment = os.environ | {"PYTHONPATH": path, STAGES_FILE: file.name}
         start = time.time()

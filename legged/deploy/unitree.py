@@ -324,7 +324,7 @@ class UnitreeRobot(Interface):
         self._first.set()
 
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Do nothing: the robot has no sources, and policies that need one are refused."""
+        """Do nothing: the robot offers no further observations, such as a height map. Policies that need one are refused."""
 
     def read(self) -> list[Reading]:
         with self._lock:

@@ -66,7 +66,7 @@ def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
 
 
 def largest_of(force: ForceConfig) -> float:
-    """Return the largest component of a force that can be drawn [N]. Observations give forces as a share of it."""
+    """Return the largest absolute value of a sampled force's components [N]. Observations give forces as a share of it."""
     return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
 
 

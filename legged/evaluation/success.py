@@ -193,8 +193,8 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
-    """Measure one terrain type in a task that stands on `tiles_of_sizes`, with `robots` robots for each size. Return a point
-    for each size, and how often a robot lost contacts in a control step because memory was full.
+    """Measure one terrain type in a task that stands on `tiles_of_sizes`, with `robots` robots for each size. Return the
+    figures of each size, and the number of robot steps in which the engine dropped contacts because its memory was full.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()

@@ -369,7 +369,7 @@ class _Calls(TorchFunctionMode):
 
     def _is_host(self, *values: Any) -> bool:
         """Return True if one of the values means the CPU. On a machine without a GPU the task's own device is the CPU too, so
-        only the text "cpu" counts there.
+        only the string "cpu" counts there.
         """
         kinds = str if self._guard.device.type == "cpu" else str | torch.device
         return any(isinstance(value, kinds) and torch.device(value).type == "cpu" for value in values)
@@ -383,7 +383,7 @@ class _Calls(TorchFunctionMode):
             return func(*args, **kwargs)
         if device is None:
             self._guard.refuse(f"torch.{func.__name__} without a device makes a tensor on the CPU: {ON_THE_DEVICE}")
-        elif self._is_host(device) and not caller().startswith("legged."):  # the learner passes its device as a text
+        elif self._is_host(device) and not caller().startswith("legged."):  # legged's learner names the CPU by a string
             self._guard.refuse(f"torch.{func.__name__} makes a tensor on the CPU: {ON_THE_DEVICE}")
         elif func in self.OF_DATA:
             return self._constant(func, given[0], args, kwargs, (device,))

@@ -284,8 +284,8 @@ class DevicePPO(CriticWarmup):
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         errors: tuple[Tensor, ...] = ()
         if targets is not None and estimates is not None:
-            # One backward pass serves both losses. The only parameters that they share are the hidden layers of an estimator
-            # with free outputs.
+            # One backward pass serves PPO's loss and the estimator's. They share parameters only if the estimator has
+            # `latent` outputs (its hidden layers) or `policy_gradient` is set (all of it).
             loss = loss + (estimates - targets).square().mean()
             assert self._errors is not None
             errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()

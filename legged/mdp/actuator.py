@@ -107,8 +107,8 @@ class Actuator:
         numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Build actuators of `shape` (N, D) on the device of `middle`, the target of action 0, (D,) or (). Delays are drawn
-        from the pool `numbers`.
+        """Build actuators of `shape` (N, D). `middle`, (D,) or (), is the joint target when all actions are zero, on the
+        device of the actuators. Delays are drawn from the pool `numbers`.
 
         Raises:
             ConfigError: as for `check_actuator`.
@@ -228,8 +228,8 @@ class Actuator:
         torch.clamp(asked, -effort, effort, out=out)
 
     def reset(self, mask: Tensor, middle: Tensor) -> None:
-        """Reset the robots in `mask` (N,) to the target of action 0, `middle` (D,), (N, D) or (), and draw their delay. With
-        delay_varies, draw the delay of all robots.
+        """Reset the robots in `mask` (N,), and draw their delay. `middle`, (D,), (N, D) or (), is the joint target when all
+        actions are zero. With delay_varies, draw the delay of all robots.
         """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()

@@ -198,7 +198,7 @@ class _RobotReader:
         state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
-        if self.stepped:  # only once per step: a later write clears the forces of its worlds
+        if self.stepped:  # once per step: a second read would undo a write, which clears forces
             forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
             if self._contacts is None:
                 state.contact_forces.copy_(forces)

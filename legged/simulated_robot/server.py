@@ -128,7 +128,7 @@ class Server:
         for sequence, body in self._in.take(now):
             with suppress(ValueError):
                 _, asked = udp.unpack_command(body)
-                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # no newer one came before
+                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # newer than the last one taken
                     self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
