@@ -1,4 +1,4 @@
-"""Physics engines behind one interface. A new engine is one file here and one branch in `make_physics`."""
+"""Physics engines behind one interface. To add an engine, add a module here and a branch in `make_physics`."""
 
 from collections.abc import Callable, Collection
 from importlib.util import find_spec
@@ -36,16 +36,16 @@ __all__ = [
 
 
 MANY_WORLDS = 256
-"""Smallest number of worlds for which `auto` chooses mujoco_warp even without a GPU, because its speed then makes up for the
-compilation of its kernels."""
+"""Smallest number of worlds for which `auto` chooses mujoco_warp on a CPU. With fewer worlds, compiling its kernels takes
+longer than its faster steps save."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
     """Return the name of the engine that runs on a device. `auto` means mujoco_warp on a GPU, and on a CPU for `MANY_WORLDS`
     or more; otherwise it means the C engine. Error messages begin with `where`, the setting's dotted path.
 
-    On a CPU, `auto` means mujoco_warp only because of its fused step. If the fused step does not support a model,
-    `make_physics` returns the C engine.
+    On a CPU, only mujoco_warp's fused step is faster than the C engine. If the fused step does not support a model, `auto`
+    makes `make_physics` return the C engine.
 
     Raises:
         ConfigError: the C engine was requested on a GPU, or the requested engine is not installed.

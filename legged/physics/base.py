@@ -31,10 +31,10 @@ class Physics(ABC):
     """MuJoCo model of one world: names, masses, joints, actuators, geometry for rendering."""
     qpos: Tensor
     """(N, nq) float32 positions in MuJoCo's layout, [m] and [rad]. A free joint has its position, world frame, then its
-    orientation (w, x, y, z). Current after a step; after a refresh it includes writes."""
+    orientation (w, x, y, z). `qpos` is up to date after a step. After a write, it is up to date once `refresh` has run."""
     qvel: Tensor
     """(N, nv) float32 velocities in MuJoCo's layout, [m/s] and [rad/s]. A free joint has the linear velocity of its origin,
-    world frame, then its angular velocity, body frame. Current when `qpos` is."""
+    world frame, then its angular velocity, body frame. Up to date whenever `qpos` is."""
     ctrl: Tensor
     """(N, nu) float32 controls, in the unit of the model's actuators ([N m] for motors of gear 1). The task writes them in
     place before a step; they keep their values until written again."""
@@ -48,14 +48,14 @@ class Physics(ABC):
     """Reason why parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused step
     does everything, or if the engine has no fused step."""
     why_c_engine: str = ""
-    """Reason why `auto` chose the C engine instead of the fused step for this many worlds. Empty if it did not."""
+    """Reason why `auto` chose the C engine although there are at least `MANY_WORLDS` worlds. Empty in all other cases."""
     fitted: str = ""
-    """Description of the simple shapes that replace meshes, because the terrain collider does not support meshes. Empty if no
-    mesh was replaced."""
+    """Description of the simple shapes that replace meshes, which the terrain collider does not support. Empty without
+    these."""
     compiled: int = 0
-    """Number of kernel modules that were compiled for this physics, because the cache lacked them."""
+    """Number of kernel modules that were not in the cache and were compiled for this physics."""
     overflowed: Tensor
-    """(N,) bool: worlds that lost contacts or constraint rows since the last refresh, because their memory was full."""
+    """(N,) bool: True for worlds that lost contacts or constraint rows since the last refresh, for lack of memory."""
     kernels: "TaskKernels | None" = None
     """Warp kernels that replace torch operations in parts of a task; None if the engine does not use Warp."""
     library_step: Callable[[], None] | None = None
@@ -65,21 +65,17 @@ class Physics(ABC):
 
     @abstractmethod
     def step(self) -> None:
-        """Advance by dt under `ctrl`. Afterwards `qpos` and `qvel` are current; all other outputs are current after
-        `refresh`.
-        """
+        """Advance by dt under `ctrl`. This updates `qpos` and `qvel`; `refresh` updates all other outputs."""
 
     @abstractmethod
     def refresh(self) -> None:
-        """Update all outputs from the engine's state by kinematics alone. Contact forces remain those of the last step."""
+        """Compute all outputs from the engine's state, by kinematics alone. Contact forces remain those of the last step."""
 
     @abstractmethod
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Set the state of the worlds in `mask` (N,) to `qpos` (N, nq) and `qvel` (N, nv), in the layout and frames of the
-        attributes.
+        """Set the state of the worlds in `mask` (N,) to `qpos` (N, nq) and `qvel` (N, nv), laid out as the attributes.
 
-        This clears controls, activations, contact forces and the solver's warm start of these worlds. Other worlds stay
-        bit-identical.
+        This clears the controls, activations, contact forces and warm starts of these worlds. Other worlds do not change.
         """
 
     @abstractmethod
@@ -90,8 +86,8 @@ class Physics(ABC):
 
     @abstractmethod
     def randomize(self, field: str, values: Tensor) -> None:
-        """Set a field of the table `fields.FIELDS` at start-up. `values` are (N,), one per world, or (N, rows), one per body,
-        joint or shape that has the property. They replace earlier values.
+        """Set a field of the table `fields.FIELDS` at start-up. `values` are (N,), one for each world, or (N, rows), one for
+        each body, joint or shape of a world that the field changes. They replace earlier values of the field.
 
         Raises:
             ValueError: the physics was not made for this field, or the values have another shape.
@@ -99,32 +95,32 @@ class Physics(ABC):
 
     @abstractmethod
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
-        """Prepare `redraw` for `fields`, which must not be derived fields (`Field.derived`). `drawn` (N, V) is the tensor
-        that every `redraw` reads. `columns` gives the columns of each field in `drawn`: one for all rows, or one per row.
-        They must include the columns of all other fields that change the same arrays.
+        """Prepare `redraw` for `fields`, which must not be derived fields (`Field.derived`). Every `redraw` reads the random
+        values in `drawn` (N, V). `columns` gives the columns of a field in `drawn`: one column for all rows that the field
+        changes, or one for each row. `columns` must also contain all other randomised fields that change the same arrays.
         """
 
     @abstractmethod
     def redraw(self, mask: Tensor) -> None:
-        """Copy the current values of `drawn` into the model arrays of the worlds in `mask` (N,). This may be captured in a
-        step.
+        """Apply the current values of `drawn` (see `prepare_redraws`) to the model arrays of the worlds in `mask` (N,). A
+        step of a `capturable` engine may contain this.
         """
 
     @abstractmethod
     def set_variants(self, values: Mapping[str, Tensor]) -> None:
-        """Prepare K variants of the model from `values`, (K, 1) or (K, rows) per derived field. C MuJoCo computes the derived
-        constants for every engine, in about 0.05 ms per variant.
+        """Prepare K variants of the model. `values` holds (K, 1) or (K, rows) numbers for each derived field. For all
+        engines, C MuJoCo computes the derived constants, in about 0.05 ms for each variant.
         """
 
     @abstractmethod
     def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy masses, inertias and derived constants of the variants `chosen` (N,) int64 into the worlds of `mask` (N,).
-        This may be captured in a step.
+        """Give each world in `mask` (N,) the masses, inertias and derived constants of a variant; `chosen` (N,) int64 holds
+        the variant's index for each world. A step of a `capturable` engine may contain this.
         """
 
     def quantity(self, name: str) -> Tensor:
         """Return an array of MuJoCo's data by its MuJoCo name: (N, ...) float32 in MuJoCo's layout, frames and units
-        (`quantities.STAGES` and `LAST_STEP`). It is always the same tensor, and current after a refresh.
+        (`quantities.STAGES` and `LAST_STEP`). Every call returns the same tensor, which is up to date after a refresh.
 
         Raises:
             ValueError: the physics was not made for this quantity.
@@ -133,8 +129,8 @@ class Physics(ABC):
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
-        """Return the arrays (N, ...) that determine the following steps, and the outputs of the last step. `ctrl` is left
-        out. After `load_state` with copies of them, the engine repeats the same steps. On a CPU the steps are bit-identical.
+        """Return the arrays (N, ...) that determine the following steps, except `ctrl`, and the outputs of the last step.
+        After `load_state` with copies of these arrays, the engine repeats the same steps; on a CPU they are bit-identical.
         """
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
@@ -145,7 +141,7 @@ class Physics(ABC):
         """
         take(self.state_tensors(), saved, type(self).__name__)
         self.refresh()
-        if self.robot_state is not None:  # the engine still holds the forces of its own last step
+        if self.robot_state is not None:  # `refresh` may have read the forces of the engine's last step
             self.robot_state.contact_forces.copy_(saved["contact_forces"])
 
     @abstractmethod

@@ -16,20 +16,20 @@ from legged.robots.robot import Robot
 @dataclass(frozen=True)
 class FootChains:
     """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), ordered from the foot to the
-    base; lengths are in metres. Each hinge has a frame, in which it turns points about its axis. At angle 0 this frame has a
-    fixed pose in the frame of the next hinge.
+    base; lengths are in metres. A hinge rotates points about its axis in the hinge's frame; `body_pos` and `body_quat` place
+    this frame.
     """
 
     offset: np.ndarray
-    """(F, 3) position of the foot in the frame of its first hinge: the mean of the centres of the foot's shapes."""
+    """(F, 3) centre of the foot (the mean of its shapes' centres) in the frame of the hinge next to it."""
     position: np.ndarray
     """(levels, F) index of the hinge's angle in MuJoCo's generalised positions; `speed` is the index of its velocity."""
     speed: np.ndarray
     axis: np.ndarray
     anchor: np.ndarray
     body_pos: np.ndarray
-    """(levels, F, 3) position of the hinge's frame at angle 0, in the frame of the next hinge; `body_quat` is its
-    orientation."""
+    """(levels, F, 3) position and `body_quat` orientation, in the frame of the next hinge, of the hinge's frame at angle
+    0."""
     body_quat: np.ndarray
 
     @classmethod
@@ -73,8 +73,8 @@ class _Hinge:
 
 
 def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
-    """Return the hinges from `body` up to `base`, and the point `offset` of the body, converted to the frame of the first
-    hinge. A body that is welded to its parent adds no hinge. A body may have several. Error messages begin with `where`.
+    """Return the hinges from `body` up to `base`. Also convert the point `offset` from the frame of `body` to the frame of
+    the first hinge. A body may have no hinge (if it is welded to its parent) or several. Error messages begin with `where`.
 
     Raises:
         ConfigError: a joint is not a hinge.
@@ -85,7 +85,8 @@ def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, whe
             if model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
                 raise ConfigError(f"{where}: joint '{model.joint(joint).name}' between base and foot is not a hinge")
             found.append(_Hinge(joint, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
-            if model.qpos0[model.jnt_qposadr[joint]] != 0.0:  # a model describes its bodies at the joints' reference angles
+            # A model gives the poses of bodies at the joints' reference angles.
+            if model.qpos0[model.jnt_qposadr[joint]] != 0.0:
                 _turn_back(model, found[-1])
         if found:
             found[-1].pos, found[-1].quat = _moved(model, body, found[-1].pos, found[-1].quat)
@@ -105,8 +106,8 @@ def _turn_back(model: mujoco.MjModel, hinge: _Hinge) -> None:
 
 
 def _moved(model: mujoco.MjModel, body: int, pos: np.ndarray, quat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a pose in a body's frame as a pose in the parent's frame, at the reference angles. The identity pose gives
-    exactly the body's own pose.
+    """Convert a pose from a body's frame to its parent's frame, at the joints' reference angles. The identity pose becomes
+    exactly the body's pose in the model.
     """
     if not pos.any() and quat[0] == 1.0:
         return model.body_pos[body].copy(), model.body_quat[body].copy()
@@ -124,7 +125,7 @@ class _Level:
     """(F,) index of the hinge's angle in the positions; `speed` is the index of its velocity."""
     speed: Tensor
     anchor: Tensor
-    """(F, 3, 1) [m]"""
+    """(F, 3, 1) position of the hinge's anchor in the hinge's frame [m]."""
     along: Tensor
     """(F, 3, 3) projection on the axis a: a a^T."""
     across: Tensor
@@ -138,13 +139,13 @@ class _Level:
 class FeetKinematics:
     """Forward kinematics of the feet in torch.
 
-    An engine's own kinematics describe the start of a step. The kinematics here are computed from the current joint state, so
-    they are never stale, and they need no engine call. Worlds are the last dimension, which is contiguous in memory, because
-    with vectors last the computation takes twice as long.
+    After a step, an engine's own kinematics are those of the step's start. Here the kinematics are computed from the current
+    joint state, without a call of the engine. The last dimension of all arrays counts worlds, because the computation takes
+    twice as long if the last dimension counts x, y and z.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
-        """Compute from `qpos` (N, nq) and `qvel` (N, nv), the current coordinates in MuJoCo's layout."""
+        """Prepare to read `qpos` (N, nq) and `qvel` (N, nv), the current coordinates in MuJoCo's layout."""
         self._qpos, self._qvel = qpos, qvel
         chains = FootChains.of(model, robot)
 
@@ -169,12 +170,10 @@ class FeetKinematics:
         ]
 
     def write(self, state: RobotState) -> None:
-        """Write `state.feet_pos` [m] and `state.feet_vel` [m/s], (N, F, 3), world frame, from the current base and joint
-        state.
-        """
+        """Compute `state.feet_pos` [m] and `state.feet_vel` [m/s], (N, F, 3), world frame, from the base and joint state."""
         feet, worlds = len(self._offset), len(state.base_pos)
         angles, rates = self._qpos.t().contiguous(), self._qvel.t().contiguous()
-        moved = torch.zeros(feet, 3, 2, worlds)  # points and velocities; the last level ends in the base frame
+        moved = torch.zeros(feet, 3, 2, worlds)  # points and velocities; after the last level, in the base frame
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor

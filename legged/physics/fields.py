@@ -1,4 +1,4 @@
-"""Table of the fields that can be randomised: field -> arrays of MuJoCo's model, for all engines that use MuJoCo's names."""
+"""Table of the fields that can be randomised, and of the arrays of MuJoCo's model that each field changes."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -24,25 +24,25 @@ def floating_bodies(model: mujoco.MjModel) -> np.ndarray:
 
 
 def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
-    """Return the degrees of freedom of hinges and slides."""
+    """Return the indices of the degrees of freedom of hinges and slides."""
     kind = model.jnt_type[model.dof_jntid]
     return np.flatnonzero((kind == mujoco.mjtJoint.mjJNT_HINGE) | (kind == mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def linear_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuators whose force is gear * gain * control: all with a non-zero first gear, except muscles."""
+    """Return the indices of actuators with force gear * gain * control: all with a non-zero first gear, except muscles."""
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
     return np.flatnonzero((model.actuator_gear[:, 0] != 0.0) & ~muscle)
 
 
 def per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return, for each actuator, the gain that makes one unit of control one unit of force, (nu,)."""
+    """Return the gain with which one unit of control produces one unit of force, for each actuator, (nu,)."""
     gear = model.actuator_gear[:, 0]
     return np.divide(1.0, gear, out=np.zeros_like(gear), where=gear != 0.0)
 
 
 def limited_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the actuators with a force limit."""
+    """Return the indices of the actuators with a force limit."""
     return np.flatnonzero(model.actuator_forcelimited)
 
 
@@ -52,8 +52,8 @@ def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
 
 
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return the bias on position that corresponds to one unit of force per control, (nu,): `-per_gear` for actuators with an
-    affine bias, 0 for others.
+    """Return `-per_gear` for actuators with an affine bias, 0 for others, (nu,). A position servo keeps its target if
+    `per_gear` is added to its gain, and this to its bias on position.
     """
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
 
@@ -71,8 +71,8 @@ class Change:
     least: float | None = 0.0
     """Smallest allowed number in the array; None for no limit."""
     bounce: Literal["", "ratio", "inverse"] = ""
-    """Conversion of the values from restitution: the array takes the damping ratio ("ratio") or its inverse. Empty if the
-    values are not restitution."""
+    """"ratio" if the values are restitutions and the array takes their damping ratios; "inverse" if it takes the inverse of
+    these. Empty if the values are not restitutions."""
 
 
 @dataclass(frozen=True)
@@ -84,20 +84,20 @@ class Field:
     what: str
     """Plural name of the things that have the property, for error messages."""
     rows: Callable[[Scene, mujoco.MjModel], np.ndarray]
-    """Function that returns the rows of the arrays that change."""
+    """Function that returns the indices of the array rows that the field changes."""
     changes: tuple[Change, ...]
     derived: bool = False
-    """True if constants of the model must be derived again."""
+    """True if a change requires MuJoCo to derive constants of the model again (`DERIVED`)."""
     neutral: float = 0.0
-    """Value that changes nothing, or the usual value."""
+    """Value that leaves the model unchanged, or a usual value if no value does."""
     lowest: float | None = None
     """Lowest meaningful value; None without a limit."""
     highest: float | None = None
     """Highest meaningful value; None without a limit."""
     law: bool = False
-    """True if the control law of legged robots uses the field, for each joint."""
+    """True if the control law of legged robots uses the field. It has one row for each joint."""
     each: bool = False
-    """True if each row has its own value, unless the configuration says otherwise."""
+    """True if each row of a world has its own random value by default, instead of one value for all rows."""
 
 
 LEAST_MASS = 1e-6
@@ -245,17 +245,17 @@ MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
 """Fields that change the model, which `Physics.randomize` accepts. The others affect only the control law."""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""Fields that can be randomised in every solver of Newton, because Newton's own model has an array for them. Newton's MuJoCo
-solver supports all fields."""
+"""Fields that every solver of Newton supports, because Newton's own model has arrays for them. Its MuJoCo solver supports
+all."""
 
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
-    """Return, for each field, the number of rows that it changes, or the number of joints that have it."""
+    """Return the number of rows of each field: of array rows that it changes, or of joints that have it."""
     return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
 
 
 def own_array(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return an array of the model by its name in `Change`; gravity has one row, (1, 3)."""
+    """Return the array of the model that `Change.array` names; gravity is returned with one row, (1, 3)."""
     return model.opt.gravity[None] if name == GRAVITY else getattr(model, name)
 
 

@@ -1,6 +1,4 @@
-"""C MuJoCo on all CPU cores, through `mujoco.batch.Batch`: the default engine without a GPU, and the reference for the
-other engines.
-"""
+"""C MuJoCo on all CPU cores, through `mujoco.batch.Batch`. It is the reference for the other engines."""
 
 from collections.abc import Collection, Mapping
 
@@ -97,7 +95,7 @@ class MujocoPhysics(Physics):
     def refresh(self) -> None:
         self._read()
         if self._robot is not None:
-            self._robot.read()  # before `_reader` calls the engine, which overwrites the sensors
+            self._robot.read()  # must precede `_reader.read`, which overwrites the sensor data
         self._reader.read()
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
@@ -180,7 +178,7 @@ class _RobotReader:
     """Computes the fields of RobotState that are not views of qpos and qvel."""
 
     def __init__(self, batch: Batch, state: RobotState, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:
-        """Read the contact sensors of the model of `batch`, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
+        """Prepare to read contact sensors from `batch`, and the task's `qpos` (N, nq) and `qvel` (N, nv)."""
         self.stepped = False
         """True if the sensors hold forces that `state` does not hold yet."""
         self._state = state
@@ -193,12 +191,12 @@ class _RobotReader:
         self._down = torch.tensor([0.0, 0.0, -1.0]).expand(len(state.base_pos), 3)
 
     def read(self) -> None:
-        """Update velocities and gravity in the base frame, the feet, and, once after a step, contact forces."""
+        """Update velocity and gravity in the base frame, the feet, and, on the first call after a step, contact forces."""
         state = self._state
         state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
-        if self.stepped:  # once per step: a second read would undo a write, which clears forces
+        if self.stepped:  # on a second call, this would undo the clearing of forces by `write`
             forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
             if self._contacts is None:
                 state.contact_forces.copy_(forces)
@@ -211,7 +209,7 @@ class _QuantityReader:
     """Copies of the requested quantities from the batch's arrays, updated for the worlds whose state has changed."""
 
     def __init__(self, batch: Batch, names: Collection[str]) -> None:
-        """Bind the quantities `names`; others cost nothing."""
+        """Prepare to copy the quantities `names`."""
         self._batch, self._stage = batch, stage_of(names)
         self._bound = {name: batch.bind(name) for name in names}
         self.values = {name: torch.zeros(bound.shape) for name, bound in self._bound.items()}

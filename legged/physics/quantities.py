@@ -14,9 +14,9 @@ STAGES = {
     "cinert": mujoco.mjtStage.mjSTAGE_POS,
     "cvel": mujoco.mjtStage.mjSTAGE_VEL,
 }
-"""Quantity -> forward stage that updates it. All are (N, nbody, ...): body positions [m] and orientations (w, x, y, z), world
-frame; centres of mass of subtrees [m]; inertias (10) and velocities (6: angular, linear) about the centre of mass of the
-kinematic tree, world frame."""
+"""Quantity -> forward stage that updates it. All are (N, nbody, ...) in the world frame: positions [m] and orientations (w,
+x, y, z) of bodies; centres of mass of subtrees [m]; inertias (10) and velocities (6: angular, linear) of bodies about the
+centre of mass of their kinematic tree."""
 LAST_STEP = ("qfrc_actuator",)
 """Quantities of the last step, which are zero after a write: (N, nv) generalised actuator forces [N m] or [N]."""
 

@@ -22,7 +22,7 @@ class RandomizedModel:
     def __init__(
         self, scene: Scene, model: mujoco.MjModel, fields: Collection[str], dtype: torch.dtype, device: torch.device
     ) -> None:
-        """Accept values of `fields`. Arrays have the type `dtype` and lie on `device`."""
+        """Prepare for values of `fields`. The arrays will have the type `dtype` and lie on `device`."""
         self.model, self._scene, self._dtype, self._device = model, scene, dtype, device
         self.rows = {name: field.rows(scene, model) for name, field in MODEL_FIELDS.items() if name in fields}
         """Field -> rows of the arrays that it changes."""
@@ -49,7 +49,7 @@ class RandomizedModel:
         return self.arrays(changed_arrays([field]), self._values)
 
     def arrays(self, names: Collection[str], values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return arrays by name, (N, ...), for the `values` of fields, (N, 1) or (N, rows)."""
+        """Return the model arrays `names`, (N, ...), changed by `values`: (N, 1) or (N, rows) numbers for each field."""
         worlds = len(next(iter(values.values())))
         found = {}
         for array in names:
@@ -63,7 +63,7 @@ class RandomizedModel:
         return found
 
     def _apply(self, change: Change, rows: Tensor, values: Tensor, array: Tensor) -> None:
-        """Change `rows` of one array (N, ...) by `values` (N, 1) or (N, R)."""
+        """Apply `change` to `rows` of `array` (N, ...), in place. `values` are (N, 1) or (N, rows)."""
         if change.bounce:
             assert self.bounces is not None
             values = self.bounces.ratio(values)
@@ -77,9 +77,9 @@ class RandomizedModel:
         part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
 
     def variants(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the arrays of K model variants, (K, ...), for `values` of derived fields, (K, 1) or (K, rows). The result
-        holds the arrays that these fields change and those that C MuJoCo derives from them (`DERIVED`). Variants are computed
-        in advance, so that no constant is derived within a step.
+        """Return the arrays of K model variants, (K, ...): those that derived fields change, and those that C MuJoCo derives
+        from them (`DERIVED`). `values` holds (K, 1) or (K, rows) numbers for each field. The variants are computed before
+        training, because no constants can be derived within a captured step.
         """
         on_host = RandomizedModel(self._scene, self.model, values, torch.float64, torch.device("cpu"))
         changed = on_host.arrays(changed_arrays(values), values)
@@ -98,9 +98,7 @@ class RandomizedModel:
 
 
 def keep_centres_apart(model: mujoco.MjModel, fields: Collection[str]) -> None:
-    """Mark the bodies of a model as having their centre of mass away from their origin, if `fields` move centres of mass.
-    MuJoCo otherwise uses shortcuts that assume the two coincide.
-    """
+    """If `fields` move centres of mass, switch off MuJoCo's shortcuts for bodies whose centre of mass is their origin."""
     if "body_ipos" in changed_arrays(fields):
         model.body_sameframe[:] = 0
         model.body_simple[:] = 0
@@ -110,8 +108,8 @@ def keep_centres_apart(model: mujoco.MjModel, fields: Collection[str]) -> None:
 def check_ranges(
     ranges: Mapping[str, Range | DrawConfig], scene: Scene, sim: SimConfig, where: Callable[[str], str] = str
 ) -> None:
-    """Check `ranges`, field -> lowest and highest value or a `DrawConfig`, against a scene. `where` maps a dotted path of the
-    configuration to the beginning of an error message.
+    """Check that a scene's model allows the fields and values of `ranges` (field -> lowest and highest value, or a
+    `DrawConfig`). `where` maps a dotted path of the configuration to the beginning of an error message.
 
     Raises:
         ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for

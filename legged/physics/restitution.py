@@ -10,7 +10,7 @@ POINTS = 1024
 
 def kept_speed(ratio: float) -> float:
     """Return the restitution of a body on a spring and damper with damping ratio `ratio` (0 to 1): the share of its speed
-    that it keeps. The contact ends as soon as its force no longer pushes.
+    that it keeps after an impact. The contact ends when its force would begin to pull.
 
     Source: Schwager and Poeschel, Coefficient of restitution and linear-dashpot model revisited (Granular Matter 9, 2007),
     equation 21: exp(-r / w * angle) with w = sqrt(1 - r^2) and angle = atan2(2 r w, 2 r^2 - 1); exp(-2) at r = 1.
@@ -45,8 +45,8 @@ class DampingOfBounces:
         """(POINTS + 1,) damping ratios."""
 
     def ratio(self, restitution: Tensor) -> Tensor:
-        """Return the damping ratios for restitutions of any shape. Ratios are limited to 1, whose restitution is exp(-2) =
-        0.135; smaller restitutions get this ratio too.
+        """Return the damping ratio for each number in `restitution`, in the same shape. Restitutions below exp(-2) = 0.135
+        get the largest damping ratio, 1.
         """
         place = restitution.clamp(0.0, 1.0) * POINTS
         index = place.long().clamp(max=POINTS - 1)

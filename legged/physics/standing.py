@@ -1,4 +1,4 @@
-"""Test of gains: the height at which a robot stands under them in C MuJoCo."""
+"""Test of PD gains: the height at which a robot stands in C MuJoCo."""
 
 import mujoco
 import numpy as np
@@ -10,14 +10,14 @@ from legged.robots.robot import Robot
 SECONDS = 2.0
 """Time that a robot is given to come to rest [s]."""
 FEWEST_FEET = 3
-"""Least number of feet on which a robot can stand without balancing; one with fewer is kept level and in place."""
+"""Least number of feet on which a robot stands without balancing. A robot with fewer feet is kept level and in place."""
 COSTLY_CONTACTS = {"cone": "elliptic", "impratio": 100.0}
-"""Settings with which feet do not creep."""
+"""Contact settings with which loaded feet do not creep."""
 
 
 def height_under_gains(robot: Robot, stiffness: np.ndarray, damping: np.ndarray) -> float:
-    """Return the height of the base [m] after two seconds in the default pose, on a plane, under gains (D,) of an explicit
-    law; 0 if the motion grows without limits. Wheels are braked by their gains on speed.
+    """Simulate a robot on a plane for two seconds, with PD control towards its default pose and gains (D,). Return the final
+    height of the base [m], or 0 if the motion diverges. The stiffness of a wheel acts on its speed, as a brake.
     """
     sim = SimConfig(**COSTLY_CONTACTS)  # type: ignore[arg-type]
     model = RobotScene(robot).model(sim)
@@ -32,5 +32,6 @@ def height_under_gains(robot: Robot, stiffness: np.ndarray, damping: np.ndarray)
         mujoco.mj_step(model, data)
         if len(robot.feet_indices) < FEWEST_FEET:
             data.qpos[[0, 1, 3, 4, 5, 6]], data.qvel[[0, 1, 3, 4, 5]] = [0.0, 0.0, 1.0, 0.0, 0.0, 0.0], 0.0
-    calm = np.isfinite(data.qpos).all() and data.time > 0.9 * SECONDS  # MuJoCo starts anew when a motion diverges
+    # When a motion diverges, MuJoCo resets the state and the time.
+    calm = np.isfinite(data.qpos).all() and data.time > 0.9 * SECONDS
     return float(data.qpos[2]) if calm else 0.0

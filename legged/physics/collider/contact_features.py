@@ -1,9 +1,9 @@
-"""Contact features of shapes, which are tested against a height map: points with a radius, segments of capsules, rim points
-and end discs of cylinders.
+"""Contact features: the parts of shapes that are tested against a height map. They are points with a radius, segments of
+capsules, and rim points and end discs of cylinders.
 
 A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
-surface in the points of its rims in which it would rest on a plane with the slope of the ground under its centre. It touches
-vertical faces and their rims with the discs at its two ends, and with the segment between the ends, as a capsule does.
+surface with points of its rims: those on which it would rest on a plane that has the slope of the ground under its centre. It
+touches vertical faces and their rims with the discs at its two ends and, like a capsule, with the segment between the ends.
 """
 
 from collections.abc import Iterable, Iterator
@@ -25,8 +25,8 @@ AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
 `end[0]`, perpendicular to the shape's z axis."""
 
 LENGTHWISE = wp.constant(0.1)
-"""Smallest cosine between a rim of the terrain and a cylinder's axis at which the rim may pass through an end disc of the
-cylinder."""
+"""Smallest cosine of the angle between a rim of the terrain and a cylinder's axis for which contacts of this rim with the
+cylinder's end discs are computed."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ContactFeature:
 
     @property
     def reach(self) -> float:
-        """Largest distance from the feature's centre to ground that it can touch [m]."""
+        """Largest distance from the feature's centre to a point that the feature can touch [m]."""
         return float(self.end[0]) if self.kind == DISC else self.radius
 
     @property
@@ -85,7 +85,7 @@ def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[C
 
 @wp.func
 def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
-    """Write the possible contacts of a thin disc with vertical faces and rims to `row`, and return their number."""
+    """Write a thin disc's possible contacts with vertical faces and their rims to row `row` of `hits`. Return their number."""
     found = around_point(ground, centre, radius + margin, True, hits, row)
     count = wp.int32(0)
     for k in range(found):
@@ -97,7 +97,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
             point = centre - across * (radius / wide)
         dist = hits.dist[row, k] - radius * wide
         if normal[2] > 0.0 and (normal[0] == 0.0 or normal[1] == 0.0):
-            # A rim along x or y: find the point where it passes through the disc's plane.
+            # The contact is with a rim along x or y. Find the point in which the rim passes through the disc's plane.
             along = wp.where(normal[0] == 0.0, axis[0], axis[1])
             to = -normal * hits.dist[row, k]
             shift = -wp.dot(to, axis) / along
@@ -107,7 +107,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
                 to[1] = to[1] + shift
             away = wp.length(to)
             dist = NOTHING
-            # a rim across the axis can touch the cylinder between its ends, but no disc
+            # A rim that is nearly perpendicular to the axis touches the cylinder only between its ends.
             if wp.abs(along) > LENGTHWISE and away > 1e-6:
                 normal = -to / away
                 point = centre - normal * radius
@@ -132,8 +132,8 @@ def find_hits(
     hits: Hits,
     row: int,
 ) -> int:
-    """Find the possible contacts of a geom's feature within `near` [m], the sum of the feature's radius and the contact
-    margin. Write them to `row`, and return their number. Distances are those before the radius is subtracted.
+    """Find the possible contacts of a geom's feature with ground nearer than `near` [m], the sum of the feature's radius and
+    the contact margin. Write them to row `row` of `hits`, without subtracting the radius from distances. Return their number.
     """
     if kind == BETWEEN:
         return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)

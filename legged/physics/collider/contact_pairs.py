@@ -1,4 +1,4 @@
-"""Pairs of shapes that may touch, and the contact parameters that MuJoCo computes for them: tables on the host."""
+"""Pairs of shapes that may touch, and their contact parameters, which are computed on the host as in MuJoCo."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -9,16 +9,17 @@ import numpy as np
 
 KINDS = mujoco.mjtGeom
 ROUND = (int(KINDS.mjGEOM_SPHERE), int(KINDS.mjGEOM_CAPSULE))
-"""Types of shapes that consist of a point or a segment with a radius, and that collide with each other as such."""
+"""Types of shapes that are a point or a segment with a radius, so that distances between them are simple to compute."""
 ON_PLANES = (*ROUND, int(KINDS.mjGEOM_ELLIPSOID), int(KINDS.mjGEOM_CYLINDER), int(KINDS.mjGEOM_BOX))
 """Types of shapes that touch a plane in a few points."""
 POINT, END, CORNER, RIM, ELLIPSOID = range(5)
-"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: an end of a capsule, with its
-radius and with friction along the capsule's axis. CORNER: corner of a box, which counts only if it is below the box's centre.
-RIM: the `radius`-th rest point of a cylinder. ELLIPSOID: the lowest point of an ellipsoid."""
+"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: an end of a capsule, with the
+capsule's radius; one direction of friction lies along the capsule's axis. CORNER: a corner of a box; it counts only if it is
+below the box's centre. RIM: one of the four points on which a cylinder rests; `radius` is the number of the point. ELLIPSOID:
+the lowest point of an ellipsoid."""
 SPRING = 7
-"""Number of parameters of a constraint's spring: stiffness [1/s^2], damping [1/s], least and greatest impedance, the depth at
-which the impedance is greatest [m or rad], and midpoint and power of the curve between."""
+"""Number of parameters of a constraint's spring: stiffness [1/s^2], damping [1/s], least and greatest impedance, depth at
+which the impedance reaches its greatest value [m or rad], and midpoint and power of the impedance curve."""
 DEFAULT_SOLREF = np.array([0.02, 1.0])
 """MuJoCo's default solref: time constant [s] and damping ratio."""
 LEAST_FRICTION, LEAST, GREATEST, TINY = mujoco.mjMINMU, mujoco.mjMINIMP, mujoco.mjMAXIMP, mujoco.mjMINVAL
@@ -31,11 +32,11 @@ class ContactPair:
     geoms: tuple[int, int]
     """Ids of the geoms, ordered by type as in MuJoCo; normals point from the first to the second."""
     margin: float
-    """Distance below which the contact exerts force [m]."""
+    """The contact exerts force if the shapes' distance is less than this [m]."""
     dim: int
     """Number of directions in which the contact exerts force: 1, 3, 4 or 6."""
     rough: tuple[int, int]
-    """Geoms whose larger friction counts; (-1, -1) if `friction` counts instead."""
+    """Ids of two geoms, of whose friction the contact uses the larger; (-1, -1) if it uses `friction` instead."""
     friction: np.ndarray
     """(5,) coefficients: sliding along two tangents, torsion about the normal, rolling about two tangents."""
     solref: np.ndarray
@@ -44,8 +45,8 @@ class ContactPair:
 
 
 def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> ContactPair:
-    """Return the contact parameters of two geoms, as MuJoCo combines them, or those of the explicit contact pair with index
-    `pair`.
+    """Return the parameters of contacts between two geoms. If `pair` is not -1, they are those of the model's explicit
+    contact pair with this index; otherwise they are combined from both geoms as in MuJoCo.
 
     Source: MuJoCo documentation, "Computation", contact parameters. mujoco-warp differs for shapes of different priority: it
     takes the smaller solref if one of them is a stiffness.
@@ -66,7 +67,8 @@ def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1)
         share = float(mixes[0] / mixes.sum()) if mixes.min() >= TINY else float(mixes[0] >= TINY)
     weights = np.array([share, 1.0 - share])
     solref = model.geom_solref[both]
-    alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()  # only one shape counts, or both have time constants
+    # Only one shape's solref counts, or both have time constants.
+    alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()
     mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())
     return ContactPair(
@@ -75,11 +77,11 @@ def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1)
 
 
 def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: bool) -> np.ndarray:
-    """Return the SPRING numbers of a constraint with MuJoCo's `solref` and `solimp`. With `safe`, the constraint's time
-    constant is at least two time steps.
+    """Return the (SPRING,) parameters of a constraint's spring, from MuJoCo's `solref` and `solimp`. With `safe`, the
+    constraint's time constant is at least two time steps.
 
-    Source: MuJoCo documentation, "Modeling", solver parameters. For a solref that `is_mixed`, mujoco-warp computes an
-    infinite stiffness.
+    Source: MuJoCo documentation, "Modeling", solver parameters. mujoco-warp computes an infinite stiffness if
+    `is_mixed(solref)`.
     """
     if is_mixed(solref):
         solref = DEFAULT_SOLREF
@@ -96,15 +98,15 @@ def spring_of(solref: np.ndarray, solimp: np.ndarray, timestep: float, safe: boo
 
 
 def is_mixed(solref: np.ndarray) -> np.ndarray:
-    """Return a mask of the solrefs (..., 2) that mix a time constant with a damping, or a stiffness with a damping ratio. C
-    MuJoCo replaces these by its default.
+    """Return a mask (...) of the `solref` (..., 2) that mix a time constant with a damping, or a stiffness with a damping
+    ratio. C MuJoCo uses its default solref instead of these.
     """
     return np.asarray((solref[..., 0] > 0.0) != (solref[..., 1] > 0.0))
 
 
 def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:
-    """Return True if each pair of shapes uses the spring of one of its shapes in all worlds, even if springs differ between
-    worlds. This holds if one shape has priority, or if both have the same solref.
+    """Return True if no contact mixes two different solrefs of the model: in each pair of shapes, one shape has priority,
+    both have the same solref, or the pair is an explicit one.
     """
     for first, second, pair in pairs:
         solref, priority = model.geom_solref[[first, second]], model.geom_priority[[first, second]]
@@ -114,7 +116,7 @@ def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) 
 
 
 def is_safe(model: mujoco.MjModel) -> bool:
-    """Return True if the model keeps the time constants of its constraints above two time steps."""
+    """Return True if MuJoCo limits the model's constraints to time constants of at least two time steps (flag `refsafe`)."""
     return not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
 
 
@@ -135,7 +137,7 @@ def kind_of(model: mujoco.MjModel, geom: int) -> str:
 
 
 def why_not(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> str:
-    """Return the reason why the contacts of a pair are not supported here; empty if all pairs are supported."""
+    """Return the reason why contacts of one of the `pairs` are not supported here, or an empty text."""
     for first, second, _ in pairs:
         kinds = [int(model.geom_type[g]) for g in (first, second)]
         on_plane = kinds[0] == KINDS.mjGEOM_PLANE and kinds[1] in ON_PLANES
@@ -152,13 +154,13 @@ class PlanePoint:
     touch: int
     kind: int
     place: np.ndarray
-    """(3,) position in the shape's frame; for RIM, radius and half length; for ELLIPSOID, the half axes [m]."""
+    """(3,) position in the shape's frame [m]. For RIM: the cylinder's radius and half length. For ELLIPSOID: half axes."""
     radius: float
     """Radius of the sphere around the point [m]; for RIM, the point's number."""
 
 
 def plane_points(model: mujoco.MjModel, touch: int, geom: int) -> Iterable[PlanePoint]:
-    """Yield the points of a geom that may touch the plane of the pair with index `touch`, in MuJoCo's order."""
+    """Yield the points of a geom that may touch a plane, in MuJoCo's order. `touch` is the index of their `ContactPair`."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == KINDS.mjGEOM_SPHERE:
         yield PlanePoint(touch, POINT, np.zeros(3), size[0])

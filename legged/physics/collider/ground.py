@@ -1,7 +1,7 @@
 """Height map on the device, and its contacts with spheres and capsules: Warp functions, geometry only.
 
-A shape consists of contact features (contact_features.py). Each feature checks the few cells under it: the surface of the
-cell below, and the vertical faces and rims of its neighbours.
+A shape consists of contact features (contact_features.py). For each feature only a few cells are checked: the surface of the
+cell below the feature, and the vertical faces and rims of the neighbouring cells.
 """
 
 import numpy as np
@@ -10,11 +10,11 @@ import warp as wp
 from legged.terrain import HeightMap
 
 FACE = wp.constant(1e-4)
-"""Height difference above which neighbouring surfaces are separated by a vertical face [m]."""
+"""Neighbouring surfaces are separated by a vertical face if their heights differ by more than this [m]."""
 RIDGE = wp.constant(0.02)
-"""Smallest drop in slope (rise over run) across a crease on which a capsule can rest between its ends."""
+"""The middle of a capsule can rest on a crease across which the slope (rise over run) drops by more than this."""
 SAME = wp.constant(0.999)
-"""Cosine between the normals of neighbouring surfaces above which they count as one surface."""
+"""Neighbouring surfaces count as one surface if the cosine of the angle between their normals is larger than this."""
 NOTHING = wp.constant(1e6)
 """Distance that stands for no contact [m]."""
 
@@ -26,16 +26,16 @@ class Ground:
     corners: wp.array2d[wp.vec4]
     """(X, Y) corner heights of each cell: at (0, 0), (1, 0), (0, 1), (1, 1) [m]."""
     ceiling: wp.array2d[float]
-    """(X, Y) highest corner within reach of a feature's end [m]."""
+    """(X, Y) height of the highest corner that a point feature over this cell can reach [m]."""
     wide_ceiling: wp.array2d[float]
-    """(X, Y) highest corner within half the length of the longest capsule [m]."""
+    """(X, Y) height of the highest corner that a capsule with its middle over this cell can reach [m]."""
     x: float
-    """World x of the outer corner of cell (0, 0) [m]; `y` in the same way."""
+    """World x of the outer corner of cell (0, 0) [m]; `y` is its world y."""
     y: float
     cell: float
-    """Edge of a cell [m]."""
+    """Edge length of a cell [m]."""
     reach: int
-    """Number of cells that the largest feature can touch on each side of the cell below its centre."""
+    """Number of cells on each side of the cell below a feature's centre that the largest feature can touch."""
 
 
 @wp.struct
@@ -43,16 +43,16 @@ class Hit:
     """Possible contact of a sphere around `point`."""
 
     dist: float
-    """Distance of the point to the ground, before the radius is subtracted [m]."""
+    """Distance from the point to the ground [m]. The sphere's radius is not subtracted."""
     normal: wp.vec3
     point: wp.vec3
     face: bool
-    """True for a contact with a vertical face or its rim, False for one with a surface."""
+    """True if the sphere touches a vertical face or its rim, False if it touches a surface."""
 
 
 @wp.func
 def cell_of(ground: Ground, x: float, y: float) -> wp.vec2i:
-    """Return the cell that contains a world point; outside the map, the nearest cell."""
+    """Return the indices of the cell that contains a world point, or of the nearest cell if the point is outside the map."""
     i = wp.int32(wp.floor((x - ground.x) / ground.cell))
     j = wp.int32(wp.floor((y - ground.y) / ground.cell))
     i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
@@ -62,7 +62,7 @@ def cell_of(ground: Ground, x: float, y: float) -> wp.vec2i:
 
 @wp.func
 def corners_of(ground: Ground, i: int, j: int) -> wp.vec4:
-    """Return the corner heights of a cell; outside the map, those of the nearest border cell."""
+    """Return the corner heights of cell (i, j) [m], or those of the nearest border cell if (i, j) is outside the map."""
     i = wp.clamp(i, 0, ground.corners.shape[0] - 1)
     j = wp.clamp(j, 0, ground.corners.shape[1] - 1)
     return ground.corners[i, j]
@@ -70,7 +70,7 @@ def corners_of(ground: Ground, i: int, j: int) -> wp.vec4:
 
 @wp.func
 def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
-    """Return (height, slope along x, slope along y) of the surface of cell (i, j) at a world point, clamped to the cell."""
+    """Return (height, slope along x, slope along y) of the surface of cell (i, j) at its point nearest to (x, y)."""
     c = corners_of(ground, i, j)
     u = wp.clamp((x - ground.x) / ground.cell - float(i), 0.0, 1.0)
     v = wp.clamp((y - ground.y) / ground.cell - float(j), 0.0, 1.0)
@@ -82,7 +82,7 @@ def surface(ground: Ground, i: int, j: int, x: float, y: float) -> wp.vec3:
 
 @wp.func
 def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
-    """Return the possible contact of `p` with the tangent plane of a surface `s` at the point `foot`."""
+    """Return the possible contact of `p` with the plane through `foot` whose slopes along x and y are `s[1]` and `s[2]`."""
     normal = wp.normalize(wp.vec3(-s[1], -s[2], 1.0))
     hit = Hit()
     hit.point = p
@@ -93,8 +93,8 @@ def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
 
 @wp.func
 def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
-    """Return the possible contact of a point below its cell's surface that pushes it out by the shortest way: up (`top`), or
-    through a vertical face at the side of the cell.
+    """Return the possible contact of a point `p` below the surface of cell (i, j). It pushes the point out by the shortest
+    way: up (`top` is this contact), or sideways through a vertical face of the cell.
     """
     best = top
     x0 = ground.x + float(i) * ground.cell
@@ -119,15 +119,15 @@ def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
 
 @wp.func
 def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
-    """Return the possible contact of a point over cell (i, j) with the neighbouring cell (ni, nj): with the neighbour's
-    vertical face, the face's rim, or the neighbour's surface if it rises.
+    """Return the possible contact of a point `p` over cell (i, j) with the neighbouring cell (ni, nj). The point may touch
+    the neighbour's vertical face, the rim of this face, or, without a face, the neighbour's surface.
     """
     x0 = ground.x + float(ni) * ground.cell
     y0 = ground.y + float(nj) * ground.cell
     qx = wp.clamp(p[0], x0, x0 + ground.cell)
     qy = wp.clamp(p[1], y0, y0 + ground.cell)
     s = surface(ground, ni, nj, qx, qy)
-    # Height of the ground just before the neighbour, on the point's side. The face is exposed above this height.
+    # Height of the ground that adjoins the neighbour on the point's side. Above this height, the neighbour's face is exposed.
     before = -NOTHING
     if ni != i:
         before = wp.max(before, surface(ground, ni - wp.sign(ni - i), nj, qx, qy)[0])
@@ -142,10 +142,11 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
             to = p - wp.vec3(qx, qy, wp.min(p[2], s[0]))
             hit.dist = wp.length(to)
             hit.normal = wp.normalize(to)
-            if hit.dist < 1e-6:  # the point is on the face itself: push it towards the open side
+            if hit.dist < 1e-6:  # the point lies on the face; push it to the side of the point's cell
                 hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
     elif s[0] > before - FACE:
-        # The two surfaces meet in a crease. The neighbour's plane counts only if its nearest point lies in the neighbour.
+        # The two surfaces meet without a face. The neighbour's counts only if the point's projection on it lies in the
+        # neighbour.
         plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
         x = p[0] - plane.dist * plane.normal[0]
         y = p[1] - plane.dist * plane.normal[1]
@@ -156,10 +157,10 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
 
 @wp.func
 def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -> Hit:
-    """Return the possible contact of a segment a-b at the `line`-th grid line across `axis` (0: x, 1: y). The segment touches
-    the rim of a vertical face there, or the ridge of a continuous surface.
+    """Return the possible contact of a segment a-b with the ground at one grid line: the `line`-th that is perpendicular to
+    `axis` (0: x, 1: y). There the segment may touch the rim of a vertical face, or the ridge of a continuous surface.
 
-    `dist` is NOTHING where the nearest point is an end of the segment, because each end is a separate feature.
+    `dist` is NOTHING if an end of the segment is nearest to the ground, because each end is a separate feature.
     """
     hit = Hit()
     hit.dist = NOTHING
@@ -181,8 +182,8 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
     s_high = surface(ground, high_i, high_j, p[0], p[1])
     rise = s_high[0] - s_low[0]
     if wp.abs(rise) > FACE:
-        # In the vertical plane across the rim, find the point of the segment that is nearest to the rim, and on which side
-        # of the rim this point lies.
+        # In the vertical plane perpendicular to the rim, find the segment's point that is nearest to the rim, and the
+        # direction from the rim to this point.
         rim = wp.max(s_low[0], s_high[0])
         open_side = -wp.sign(rise)
         across, up = d[axis], d[2]
@@ -193,11 +194,11 @@ def rim_or_ridge(ground: Ground, a: wp.vec3, b: wp.vec3, axis: int, line: int) -
         if t <= 0.0 or t >= 1.0:
             return hit
         scale = 1.0 / wp.sqrt(length_sq)
-        normal = wp.vec2(-up * scale, across * scale)  # components across the rim and upward
+        normal = wp.vec2(-up * scale, across * scale)  # horizontal and vertical component
         if normal[0] * open_side + normal[1] < 0.0:
             normal = -normal
         if normal[0] * open_side < -1e-3 or normal[1] < -1e-3:
-            return hit  # the face or the tread is nearer than the rim
+            return hit  # the vertical face or the upper surface is nearer than the rim
         p = a + t * d
         dist = (p[axis] - at) * normal[0] + (p[2] - rim) * normal[1]
         if dist > -ground.cell:
@@ -219,8 +220,8 @@ MOST = wp.constant(6)
 
 @wp.struct
 class Hits:
-    """Memory for MOST contacts of each feature of each world, one row per feature. In registers they would leave too little
-    room for other variables.
+    """Memory for MOST contacts of each feature of each world, with one row for each feature and world. Local arrays of this
+    size would take too many registers.
     """
 
     dist: wp.array2d[float]
@@ -230,7 +231,7 @@ class Hits:
 
 @wp.func
 def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
-    """Append a possible contact to a row that has `count`, if there is room. Return the new count."""
+    """Append a possible contact to a row that holds `count` contacts, if there is room. Return the new number of contacts."""
     if count >= MOST:
         return count
     hits.dist[row, count] = hit.dist
@@ -241,8 +242,8 @@ def add(hits: Hits, row: int, count: int, hit: Hit) -> int:
 
 @wp.func
 def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits: Hits, row: int) -> int:
-    """Find the possible contacts of a sphere around `p` within `near` [m]; with `faces_only`, only those with vertical faces
-    and their rims. Write them to `row`, and return their number.
+    """Find the possible contacts of a sphere around `p` with ground that is nearer to `p` than `near` [m]. With `faces_only`,
+    find only those with vertical faces and their rims. Write them to row `row` of `hits`, and return their number.
     """
     count = wp.int32(0)
     cell = cell_of(ground, p[0], p[1])
@@ -276,8 +277,8 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
 
 @wp.func
 def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits, row: int) -> int:
-    """Find the possible contacts of a capsule a-b between its ends: the nearest rim or ridge of each half. Write them to
-    `row`, and return their number.
+    """Find the possible contacts of a capsule a-b between its ends: for each half, the one with the nearest rim or ridge.
+    Write them to row `row` of `hits`, and return their number.
     """
     middle = 0.5 * (a + b)
     cell = cell_of(ground, middle[0], middle[1])
@@ -291,7 +292,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
         start = wp.where(axis == 0, ground.x, ground.y)
         low = wp.int32(wp.floor((wp.min(a[axis], b[axis]) - near - start) / ground.cell)) + 1
         high = wp.int32(wp.floor((wp.max(a[axis], b[axis]) + near - start) / ground.cell))
-        # Lines outside the map are skipped, because a capsule in a world that diverges could cross billions of lines.
+        # Grid lines outside the map are skipped, because in a world that diverges, a capsule could cross billions of lines.
         last = wp.where(axis == 0, ground.corners.shape[0], ground.corners.shape[1]) - 1
         for line in range(wp.clamp(low, 1, last), wp.clamp(high, 1, last) + 1):
             hit = rim_or_ridge(ground, a, b, axis, line)
@@ -310,7 +311,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
 
 
 def room_for_hits(rows: int) -> Hits:
-    """Return memory for the contacts of `rows` features, on Warp's current device."""
+    """Return memory with `rows` rows on Warp's current device."""
     hits = Hits()
     hits.dist = wp.zeros((rows, int(MOST)), dtype=float)
     hits.normal = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
@@ -319,8 +320,8 @@ def room_for_hits(rows: int) -> Hits:
 
 
 def ground_of(height_map: HeightMap, largest: float, longest: float) -> Ground:
-    """Return the map on Warp's current device, for features of radius up to `largest` [m] and capsules of length up to
-    `longest` [m].
+    """Return `height_map` on Warp's current device. Features have radii up to `largest`, capsules lengths up to `longest`
+    [m].
     """
     reach = int(np.ceil(largest / height_map.cell - 1e-9))
     wide = int(np.ceil((0.5 * longest + largest) / height_map.cell))

@@ -13,7 +13,7 @@ from legged.physics.collider import contact_pairs
 POINT, END, CORNER = wp.constant(contact_pairs.POINT), wp.constant(contact_pairs.END), wp.constant(contact_pairs.CORNER)
 RIM = wp.constant(contact_pairs.RIM)
 FAR = wp.constant(1e6)
-"""Distance of shapes that do not touch [m]."""
+"""Distance that is returned for shapes that do not touch [m]."""
 
 
 @wp.struct
@@ -30,15 +30,15 @@ class PlaneHit:
 
 @wp.func
 def rim_point(normal: wp.vec3, turn: wp.mat33, radius: float, half_length: float, k: int) -> wp.vec3:
-    """Return the k-th point in which a cylinder rests on a plane, relative to its centre: the lowest point of the near rim,
-    the lowest point of the far rim, and two more points of the near rim that form a triangle with the first.
+    """Return the k-th point on which a cylinder rests on a plane, relative to the cylinder's centre. Points 0 and 1 are the
+    lowest points of the lower and of the upper rim. Points 2 and 3 lie on the lower rim and form a triangle with point 0.
     """
     axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
     if wp.dot(normal, axis) > 0.0:
         axis = -axis
     down = axis * wp.dot(normal, axis) - normal
     length = wp.length(down)
-    if length < 1e-6:  # the cylinder stands upright: all points of the rim are equally low
+    if length < 1e-6:  # the cylinder stands upright, and all points of a rim are equally low
         down = wp.vec3(turn[0, 0], turn[1, 0], turn[2, 0])
         length = 1.0
     down = down * (radius / length)
@@ -55,14 +55,14 @@ def rim_point(normal: wp.vec3, turn: wp.mat33, radius: float, half_length: float
 def on_plane(
     plane: wp.vec3, normal: wp.vec3, position: wp.vec3, turn: wp.mat33, kind: int, place: wp.vec3, radius: float
 ) -> PlaneHit:
-    """Return the contact of a shape's point (`contact_pairs.PlanePoint`) with the plane through `plane`."""
+    """Return the contact of a shape's point (`contact_pairs.PlanePoint`) with a plane; `plane` is a point of the plane."""
     hit = PlaneHit()
     around = radius
     offset = turn * place
     if kind == RIM:
         offset = rim_point(normal, turn, place[0], place[1], wp.int32(radius))
         around = 0.0
-    elif kind > RIM:  # an ellipsoid
+    elif kind > RIM:
         stretched = wp.normalize(wp.cw_mul(wp.transpose(turn) * normal, place))
         offset = -(turn * wp.cw_mul(stretched, place))
     point = position + offset
@@ -75,7 +75,7 @@ def on_plane(
         axis = wp.vec3(turn[0, 2], turn[1, 2], turn[2, 2])
         tangent = axis - normal * wp.dot(normal, axis)
         length = wp.length(tangent)
-        if length > 1e-6:  # otherwise the shape stands upright, and no tangent is preferred
+        if length > 1e-6:  # an upright shape has no preferred tangent
             tangent = tangent * (1.0 / length)
             hit.frame = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
     return hit
@@ -85,8 +85,9 @@ def on_plane(
 def round_shapes(
     first: wp.vec3, first_turn: wp.mat33, first_size: wp.vec2, second: wp.vec3, second_turn: wp.mat33, second_size: wp.vec2
 ) -> tuple[wp.vec2, mat23f, mat23f]:
-    """Return distances, positions and normals of the contacts of two capsules (radius, half length); a sphere has half length
-    0. There is one contact, or two if the capsules are parallel; the distances of missing contacts are infinite.
+    """Return distances, positions and normals of the contacts between two capsules, whose sizes are (radius, half length); a
+    sphere is a capsule of half length 0. There are two contacts if the capsules are parallel, and one otherwise; the distance
+    of a missing contact is infinite.
     """
     first_axis = wp.vec3(first_turn[0, 2], first_turn[1, 2], first_turn[2, 2])
     second_axis = wp.vec3(second_turn[0, 2], second_turn[1, 2], second_turn[2, 2])

@@ -1,11 +1,11 @@
 """Contacts of simple shapes with a height map, in one Warp kernel after mujoco-warp's own collisions.
 
-mujoco-warp collides with a height field by a general convex solver (GJK) on triangular prisms. That costs ten times as much,
-and a riser becomes a ramp one cell wide. Here a contact needs only a few lookups (ground.py).
+mujoco-warp itself tests shapes against the triangular prisms of a height field with a general convex solver (GJK). That takes
+ten times as long, and vertical faces become ramps one cell wide. Here a contact needs only a few look-ups (ground.py).
 
 Conventions: the normal points from the terrain (first geom) to the robot's shape; `dist` is negative in penetration; the
-contact point lies halfway between the two surfaces, as in MuJoCo. Friction directions follow from the normal alone, whereas
-MuJoCo aligns them with a capsule on a plane; the friction cone is the same.
+contact point lies halfway between the two surfaces, as in MuJoCo. The directions of friction depend on the normal alone. For
+a capsule on a plane, MuJoCo instead aligns one direction with the capsule's axis; the friction cone is the same.
 """
 
 from collections.abc import Iterable
@@ -108,7 +108,7 @@ def touch_ground(
     contact_adhesion: wp.array[float],
     nacon: wp.array[int],
 ):
-    """Find up to MOST contacts of a feature, and append them to mujoco-warp's. One thread per world and feature."""
+    """Find up to MOST contacts of a feature, and append them to mujoco-warp's contacts. One thread per world and feature."""
     world, feature = wp.tid()
     geom = feature_geom[feature]
     radius = feature_radius[feature]
@@ -190,7 +190,7 @@ class TerrainContact:
         map; `shapes` are the geoms that collide with it. Warp's current device must be that of `m` and `d`.
 
         Raises:
-            ConfigError: a colliding shape is of a type without contact features.
+            ConfigError: a shape in `shapes` is of a type without contact features.
         """
         self.terrain = terrain
         self.features = features = list(contact_features(model, shapes))

@@ -1,10 +1,10 @@
-"""Active set of the last step: the state of each constraint row at its end, which most rows keep in the next step.
+"""Active set: the state of each constraint row at the end of the last step, from which the solver starts the next step.
 
-The state of a row tells which piece of the row's piecewise cost applies. A row of a contact or a limit exerts force or does
-not. A row of dry friction holds, or slips in one of two directions. Newton's method has converged when it knows all states.
-Starting from the acceleration of the last step alone takes four iterations, because the forces of stiff contacts depend on
-small differences of accelerations, and accelerations change by more than these between steps. The states seldom change, so
-starting from them saves half of the iterations and nearly all line searches.
+The cost of a row is piecewise, and the row's state names the piece that applies. A row of a contact or a limit exerts force
+or does not. A row of dry friction holds, or slips in one of two directions. Newton's method has converged when all states are
+right. It takes four iterations if it starts only from the last step's acceleration: the forces of stiff contacts depend on
+small differences of accelerations, and from step to step accelerations change by more. The states seldom change, so a start
+from them saves half of the iterations and nearly all line searches.
 """
 
 from dataclasses import dataclass
@@ -21,10 +21,10 @@ ROW_STATES = {"UNKNOWN": UNKNOWN, "SLIPPING_BACK": SLIPPING_BACK, "SLIPPING": SL
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """Arrays of all worlds, on Warp's current device at construction."""
+    """Row keys and row states of all worlds, on the device that is Warp's current one at construction."""
 
     key: wp.array
-    """(N, rows) stable key of each row, ascending, after the rows of equality constraints."""
+    """(N, rows) key that identifies a row across steps. Keys ascend; the first rows, of equality constraints, have none."""
     last: wp.array
     """(N, 1 + rows) number of rows in the last step, followed by their stored states in the same order."""
 

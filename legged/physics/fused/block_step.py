@@ -1,9 +1,8 @@
-"""Physics step on a CPU, in blocks of worlds: each block passes through all stages of the step, and several threads work on
-blocks at the same time.
+"""Physics step on a CPU, in blocks of worlds. Each block passes through all stages of the step; threads share the blocks.
 
-If a launch made one stage for all worlds, its results would be out of the cache before the next stage reads them. A block's
-data stay in the cache of one core through all stages. A Warp launch on a CPU uses one thread, so blocks are distributed over
-several threads that launch concurrently. A world's results do not depend on the number of threads.
+If each launch computed one stage for all worlds, a stage's results would have left the cache before the next stage reads
+them. The data of a block stay in one core's cache through all stages. A Warp launch on a CPU uses one thread, so blocks are
+distributed over several threads that launch concurrently. A world's results do not depend on the number of threads.
 """
 
 from collections.abc import Callable
@@ -23,9 +22,7 @@ from legged.physics.fused.wide_solver import WIDE, wide_function
 
 
 def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
-    """Return the kernel for a prepared `step` and its `contacts`. It is launched with dimension (blocks,) for the worlds
-    from `first` to `end - 1`.
-    """
+    """Return the kernel for a `step` and its `contacts`, of dimension (blocks,). It steps the worlds `first` to `end - 1`."""
     assert step.solver.wide is not None
     move_world = dynamics_function(step.dynamics.constants)
     contacts_of_world = stage_function(contacts.constants, *contacts.kinds)
@@ -63,14 +60,14 @@ def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
 
 
 class BlockStep:
-    """Launches of a complete step for the worlds of mujoco-warp's data on a CPU."""
+    """Makes complete steps of all worlds in mujoco-warp's data on a CPU."""
 
     def __init__(self, step: TorqueStep, contacts: ContactStage, threads: int) -> None:
-        """Prepare the launches of `step` and `contacts` on several `threads`. `fits` must be True for `step`."""
+        """Prepare to launch `step` and `contacts` on `threads` threads. `fits(step)` must be True."""
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
         solver = step.solver
-        moved = contacts.equalities  # poses were computed before, because rows of equality constraints depend on them
+        moved = contacts.equalities  # `_before_blocks` has computed poses if there are equality constraints
         self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, *solver.settings, solver.arrays, step.state]
         blocks = -(-step.worlds // WIDE)
         threads = min(threads, blocks)
@@ -102,7 +99,7 @@ class BlockStep:
         return make_step
 
     def _before_blocks(self) -> None:
-        """Launch mujoco-warp's own kernels for the rows of equality constraints of all worlds."""
+        """If the model has equality constraints, compute poses and the rows of these constraints, for all worlds."""
         if self._contacts.equalities:
             self._step.begin()
             self._contacts.launch_equalities()

@@ -1,8 +1,8 @@
 // Constraint rows of one world, and their distribution over lanes. Constants: NV (degrees of freedom, at most 64), ROWS
 // (largest number of constraint rows), KEPT_ROWS (rows of the Jacobian in shared memory), STRIDE (floats from one row of a
 // matrix to the next), ENTRIES (stored entries of the mass matrix), FRICTION (there may be rows of dry friction), DRY (all of
-// these belong to degrees of freedom), SPLIT (the tree has branches), ROOT (degrees of freedom before the first branch),
-// KNOWN (rows have keys by which their states of the last step are found), and the row states of active_set.py.
+// these belong to degrees of freedom), SPLIT (the tree has branches), ROOT (number of degrees of freedom before the first
+// branch), KNOWN (rows have keys, with which their states of the last step are found), and the row states of active_set.py.
 //
 // On a GPU each lane holds the data of one or two degrees of freedom, including a row of each matrix, in registers. Shared
 // memory holds the data of constraint rows and the data that all lanes read often. On the CPU one thread holds everything,
@@ -10,15 +10,14 @@
 
 #if defined(__CUDA_ARCH__)
 #define EACH_DOF(i) UNROLLED for (int slot = 0; slot < DOFS; ++slot) if (const int i = dof_at(slot); i < NV)
-// One row after the other for each lane, not unrolled: worlds with more than 32 rows are few, and short code stays in the
-// instruction cache.
+// Loops over a lane's rows. It is not unrolled: few worlds have over 32 rows, and short code stays in the instruction cache.
 #define EACH_ROW(r) ROLLED EACH(r, rows)
-// All lanes take part, also with r beyond the last row, as `rank` requires.
+// The same, but all lanes execute each pass, also with r beyond the last row, because `rank` requires it.
 #define EVERY_ROW(r) ROLLED for (int first = 0; first < rows; first += 32) if (const int r = first + lane; true)
 #define OF(values, i) values[slot]
 const int DOFS = NV > 32 ? 2 : 1, KEPT = KEPT_ROWS;
-// Degree of freedom in a lane's slot. With more than 32, those of the root take second slots, since they need no row of a
-// matrix.
+// Returns the degree of freedom in a slot of this lane. If there are more than 32, second slots hold those of the root,
+// because they need no row of a matrix.
 auto dof_at = [&](int slot) {
     if (NV <= 32) return lane;
     return slot == 0 ? ROOT + lane : lane < ROOT ? lane : 32 + lane;
@@ -37,7 +36,7 @@ float* jv = force;  // J times the step, until new forces are computed
 LEGGED_SHARED signed char states[ROWS];
 LEGGED_SHARED short pushing[ROWS];  // rows that exert force or have curvature
 LEGGED_SHARED bool couples[ROWS];  // true for a row that moves degrees of freedom of several branches
-const int DRY_DOFS = DRY ? NV : 1;  // data of the dry friction row of each degree of freedom; its index, or -1
+const int DRY_DOFS = DRY ? NV : 1;  // dry friction rows by degree of freedom; `dry_row` is the row, or -1
 LEGGED_SHARED float dry_D[DRY_DOFS], dry_loss[DRY_DOFS], dry_reference[DRY_DOFS], dry_curvature[DRY_DOFS];
 LEGGED_SHARED signed char dry_states[DRY_DOFS];
 LEGGED_SHARED short dry_row[DRY_DOFS];
@@ -47,17 +46,16 @@ const float TINY = 1e-15f;
 
 const int ne = arrays.equalities.data[world], frictions = FRICTION ? arrays.frictions.data[world] : 0;
 const int of_all = arrays.nefc.data[world] < ROWS ? arrays.nefc.data[world] : ROWS;
-// Rows of dry friction that each belong to one degree of freedom are stored with it, and are not counted as rows below.
+// With DRY, each row of dry friction is stored with its degree of freedom, and is not counted in `rows`.
 const int dry = DRY ? (ne + frictions < of_all ? frictions : of_all > ne ? of_all - ne : 0) : 0;
 const int rows = of_all - dry, nf = ne + (DRY ? 0 : frictions);
 auto efc_row = [&](int r) { return DRY && r >= ne ? r + dry : r; };
-const int width = arrays.jacobian.shape[2];  // padded
-// Returns a number of row r. Arrays differ in the number of rows that they have room for.
+const int width = arrays.jacobian.shape[2];  // padded length of a row
+// Returns the number of row r in an array. Arrays may have room for different numbers of rows.
 auto number_of = [&](const auto& array, int r) { return array.data[(long long)world * array.shape[1] + efc_row(r)]; };
 const float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 auto smooth = [&](int i) { return arrays.qfrc_smooth.data[world * arrays.qfrc_smooth.shape[1] + i]; };
-// Calls `use(r, row)` with row r of the Jacobian. Rows in shared memory and the others, which few worlds have, are read
-// differently.
+// Calls `use(r, row)` with row r of the Jacobian, from shared memory or, in the few worlds with many rows, global memory.
 auto with_row = [&](int r, auto use) {
     if (r < KEPT) use(r, static_cast<const float*>(J + r * STRIDE));
     else if (KEPT < ROWS) use(r, jacobian + (long long)efc_row(r) * width);
@@ -69,7 +67,7 @@ auto each_pushing = [&](auto use) {
     if (KEPT < ROWS)
         ROLLED for (int k = near_pushers; k < pushers; ++k) use(pushing[k], jacobian + (long long)efc_row(pushing[k]) * width);
 };
-// Returns a row of the Jacobian times `shown`.
+// Returns the product of row r of the Jacobian and `shown`.
 auto along_row = [&](int r) {
     float total = 0.0f;
     if (r < KEPT) {
@@ -80,22 +78,22 @@ auto along_row = [&](int r) {
     return total;
 };
 
-// Returns the derivative of the dry friction cost at x. `state` becomes the curvature on the quadratic piece of the cost, and
-// -1 or -2 on the linear pieces.
+// Returns the derivative of the dry friction cost at `at`. Sets `state` to the curvature on the quadratic piece of the cost,
+// and to -1 or -2 on the linear pieces.
 [[maybe_unused]] auto rub = [](float d, float loss, float at, float& state) {
     state = d;
     if (d * at > loss) { state = -1.0f; return loss; }
     if (d * at < -loss) { state = -2.0f; return -loss; }
     return d * at;
 };
-// Returns the same derivative on the piece that `state` names, even if x lies on another piece.
+// Returns the same derivative for the piece that `state` names, even if `at` lies on another piece.
 [[maybe_unused]] auto rub_on = [](float d, float loss, float at, float& state) {
     if (state == IDLE) return 0.0f;
     if (state < IDLE) return state == SLIPPING ? loss : -loss;
     state = d;
     return d * at;
 };
-// Returns the derivative of the cost of row r, and its `state` in the same way.
+// Returns the derivative of the cost of row r at `at`, and sets `state` as `rub` does.
 auto pull = [&](int r, float at, float& state) {
     const float d = D[r];
     state = d;
@@ -154,7 +152,7 @@ EACH_DOF(i) {
     OF(rest, i) = total - smooth(i);
 }
 EACH_ROW(r) x[r] += along_row(r);
-// Read the row states of the last step. After a reset there is no acceleration to start from, and they are not used.
+// Read the row states of the last step. They are not used after a reset, which sets the last acceleration to zero.
 [[maybe_unused]] auto last_rows = [&](int k) -> int& {
     return arrays.last_rows.data[(long long)world * arrays.last_rows.shape[1] + k];
 };
@@ -167,7 +165,7 @@ if (KNOWN) {
     int* before = reinterpret_cast<int*>(force);
     EACH(k, had) before[k] = last_rows(1 + k);
     meet();
-    // Returns the state of the k-th row after the equalities. A row often has the same place as in the last step.
+    // Returns the last state of the k-th row after the equality rows. Looks at place k first: rows often keep their place.
     auto state_of = [&](int k) {
         const int key = key_of(ne + k);
         int place = k;

@@ -1,10 +1,9 @@
-// MuJoCo's Newton solver for the constraint forces of one world. It follows constraint_rows.h, elliptic_cones.h and
-// elimination.h. Constants: DAMPED (dampers are integrated implicitly), and SPLIT, FRICTION, ELLIPTIC, KNOWN as in those
-// files.
+// MuJoCo's Newton solver for the constraint forces of one world. This file comes after constraint_rows.h, elliptic_cones.h
+// and elimination.h. Constants: DAMPED (dampers are integrated implicitly), and SPLIT, FRICTION, ELLIPTIC, KNOWN as there.
 
 int round = 0;
 const float INFINITE = 3.0e38f, ENOUGH = 0.1f;
-float alpha = 0.0f;  // length of the last step; after a full step without changed states, the minimum is reached
+float alpha = 0.0f;  // last step length; if it is 1 and no state changes, the minimum is reached
 [[maybe_unused]] float dragged[DOFS];  // dry friction, as a force against the motion
 while (true) {
     // The first step goes to the minimum of the quadratic function that the states of the last step define.
@@ -17,7 +16,7 @@ while (true) {
             int state;
             if (ELLIPTIC && directions[r] > 0) {
                 state = press(r);
-                changed |= state == 2;  // there the cost is not quadratic
+                changed |= state == 2;  // zone 2: the cost is not quadratic
             } else {
                 float piece = states[r];
                 const bool given = guessing && states[r] != UNKNOWN;
@@ -75,7 +74,7 @@ while (true) {
         break;
     }
 
-    // Along the step, compute the derivative slope + alpha * bend of the inertial part, and J s for every row.
+    // Compute J s for every row. The inertial cost has the derivative slope + alpha * bend along the step.
     float sums[4] = {};
     EACH_DOF(i) {
         float total = 0.0f;
@@ -123,7 +122,7 @@ while (true) {
         if (!(fabsf(first) > flat)) break;
         if (first < 0.0f) low = alpha; else high = alpha;
         float next = alpha - first / second;
-        if (fabsf(next - alpha) <= 1e-7f * alpha) break;  // limit of float32
+        if (fabsf(next - alpha) <= 1e-7f * alpha) break;  // float32 resolves no smaller change
         if (high > 0.0f && (next <= low || next >= high)) next = 0.5f * (low + high);
         alpha = next;
     }

@@ -1,12 +1,12 @@
-"""MuJoCo's Newton solver for constraint forces in one launch: a warp of threads per world; the world's data stay on the chip.
+"""MuJoCo's Newton solver for constraint forces in one launch. A warp of threads keeps a world's data on the chip.
 
 mujoco-warp needs about ten launches per iteration of the solver, and iterates until the slowest world has converged. Here
-each world stops on its own. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"): 0.5 (a -
-a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a. For a limit or an edge of a friction pyramid, s_r is
-quadratic on the side on which the constraint exerts force; for dry friction it is Huber's function. The objective is
-piecewise quadratic. Newton's method with a line search ends when no row changes its state, that is, the piece of its cost. It
-starts with the active set of the last step (active_set.py): the minimum of the quadratic function that these states define is
-usually at or near the solution.
+each world stops when it has converged. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"):
+0.5 (a - a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a. For a limit or an edge of a friction pyramid, s_r
+is quadratic on the side on which the constraint exerts force; for dry friction it is Huber's function. The objective is
+piecewise quadratic. Newton's method with a line search ends when no row changes its state, the piece of its cost that
+applies. It starts with the states of the last step (active_set.py). They define a quadratic function whose minimum is usually
+near the solution.
 """
 
 from typing import Any
@@ -25,15 +25,15 @@ SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_
 ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 MOST_ROWS = 512
 KEPT_BYTES = 3600
-"""Size of the part of a Jacobian that a block keeps in shared memory. Further rows are read from global memory, so that more
-worlds run at once."""
+"""Largest part of a Jacobian that a block keeps in shared memory [bytes]. All further rows are read from global memory, which
+lets more worlds run at once."""
 MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
-"""Shared memory of a multiprocessor (of an H100), and the part of it that each block reserves."""
+"""Shared memory of a multiprocessor of an H100, and the part of it that each block reserves [bytes]."""
 
 
 def row_length(nv: int) -> int:
-    """Return the number of floats between rows of a matrix in shared memory: an odd number of vectors of four, so that lanes
-    that read different rows use different banks.
+    """Return the number of floats from one row of a matrix to the next in shared memory. It is an odd multiple of four, so
+    that lanes that read different rows use different memory banks.
     """
     return 4 * (-(-nv // 4) | 1)
 
@@ -58,7 +58,7 @@ def solver_constants(
         friction: True if there are rows of dry friction.
         dry: True if all rows of dry friction belong to degrees of freedom, and none to tendons.
         elliptic: True for elliptic friction cones.
-        known: True if rows have keys by which their states of the last step are found.
+        known: True if rows have keys, with which the solver finds their states of the last step.
     """
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
@@ -75,8 +75,8 @@ def solver_constants(
 
 
 def blocks(constants: dict[str, int | bool]) -> int:
-    """Return the smallest number of worlds that a multiprocessor must hold, which limits the registers per lane. It is the
-    largest multiple of the four schedulers that fits the shared memory, from 4 to 32.
+    """Return the number of worlds that a multiprocessor must be able to run at once; the compiler limits the registers of a
+    lane accordingly. It is the largest multiple of 4, from 4 to 32, for which the shared memory suffices.
     """
     nv, rows, stride = constants["NV"], constants["ROWS"], constants["STRIDE"]
     pitch, path = (4 * ((n + 4) // 4) for n in (constants["DEPTH"], nv))
@@ -87,7 +87,7 @@ def blocks(constants: dict[str, int | bool]) -> int:
 
 
 def solver_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel for a set of `solver_constants`. It is launched for (worlds, lanes)."""
+    """Return the kernel for a set of `solver_constants`. Its launch dimension is (worlds, lanes)."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_world(
@@ -105,26 +105,24 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
 
 
 def ask_for_dense_rows(model: mujoco.MjModel) -> None:
-    """Make mujoco-warp store dense rows of the Jacobian, which this solver reads. By default it stores sparse rows above 32
-    degrees of freedom.
-    """
+    """Make mujoco-warp store dense Jacobians, which this solver reads. Its default above 32 degrees of freedom is sparse."""
     if model.nv <= MOST_DOFS:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
 
 class ConstraintSolver:
-    """Constraint forces and accelerations of all worlds, from mujoco-warp's data."""
+    """Computes constraint forces and accelerations of all worlds from mujoco-warp's data."""
 
     advance: wp.array2d
-    """(worlds, nv) accelerations that integrate velocities: `qacc`, or another array if dampers are integrated implicitly."""
+    """(worlds, nv) accelerations that change velocities: `qacc`, or another array if dampers are integrated implicitly."""
 
     def __init__(
         self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, active_set: ActiveSet | None = None
     ) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a model for which `why_not` is empty. With `damped`, also
-        compute the acceleration with implicitly integrated dampers. With `active_set`, start from the states of the last
-        step; elliptic cones do not use it, since a sliding cone's cost is not quadratic. Warp's current device must be that
-        of `m` and `d`.
+        """Prepare the launch for a `model` that `why_not` accepts; `m` and `d` are mujoco-warp's model and data for it. With
+        `damped`, also compute the acceleration with implicitly integrated dampers. With `active_set`, start from the row
+        states of the last step; elliptic cones do not use it, since a sliding cone's cost is not quadratic. Warp's current
+        device must be that of `m` and `d`.
         """
         tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
@@ -166,7 +164,7 @@ class ConstraintSolver:
 
     @staticmethod
     def why_not(m: Any, d: Any) -> str:
-        """Return the reason why this solver does not support a model; empty if it does."""
+        """Return the reason why this solver does not support a model, or an empty text if it does."""
         if not 1 <= m.nv <= MOST_DOFS:
             return f"the model has {m.nv} degrees of freedom; 1 to {MOST_DOFS} are supported"
         if m.is_sparse:

@@ -22,8 +22,8 @@ FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
 
 @wp.struct
 class StageArrays:
-    """Arrays of the kernel. It reads its own tables and arrays of mujoco-warp's model and data, and writes the arrays from
-    `equalities` on. Arrays `touch_*` have one row per `ContactPair`.
+    """Arrays of the kernel: its own tables, and arrays of mujoco-warp's model and data. The kernel writes `contact_touch`,
+    `contact_mark`, `row_key` and all arrays after `equalities`. Arrays `touch_*` have one row for each `ContactPair`.
     """
 
     touch_geom: wp.array[wp.vec2i]
@@ -94,7 +94,7 @@ NAMES = {
     "row_type": "efc.type",
     "row_id": "efc.id",
 }
-"""Array -> its name in mujoco-warp's data, where the names differ."""
+"""Array -> name in mujoco-warp's data, for arrays that have another name there."""
 
 
 @wp.struct
@@ -141,8 +141,8 @@ def keep(
 
 
 def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return the kernel for a set of `stage_constants`. The flags tell which kinds of candidates a model has: points on
-    `planes`, `pairs` of round shapes, contact features on the `ground`. It is launched for (worlds, lanes).
+    """Return the kernel for a set of `stage_constants`; its launch dimension is (worlds, lanes). The flags tell which kinds
+    of candidates a model has: points on `planes`, `pairs` of round shapes, contact features on the `ground`.
     """
     contacts_of_world = stage_function(constants, planes, pairs, ground)
 
@@ -155,7 +155,7 @@ def stage_kernel(constants: dict[str, int | bool], planes: bool, pairs: bool, gr
 
 
 def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, ground: bool) -> Any:
-    """Return the device function of the kernel, which one lane calls for one world."""
+    """Return the kernel's device function, which all lanes of a world call."""
     most = int(constants["SLOTS"])
 
     @wp.func_native(native_source(("prefix_sum.h",), {}))

@@ -4,15 +4,15 @@
 // a contact), FRICTIONS, LIMITS, BALLS, EQUALITIES (the model has dry friction, joint limits, ball joints, equality
 // constraints), DENSE_FRICTION (the Jacobian's rows of dry friction are read), BOUNCES (the springs of contacts differ
 // between worlds), ELLIPTIC (friction cones instead of pyramids), and MuJoCo's numbers BALL, CONSTRAINT (a type of contact),
-// FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (an overflow flag). Each row has a key, by which the solver finds its
-// state of the last step. Keys ascend from row to row: first those of degrees of freedom, then of joints, then of candidates
-// for contacts.
+// FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (an overflow flag). Each row has a key, with which the solver finds
+// the row's state in the last step. Keys ascend from row to row: first those of degrees of freedom, then of joints, then of
+// candidates for contacts.
 
 // Record of a contact: its offsets from the centres of mass of the two trees, its axes, its friction coefficients, and the
 // parameters of its rows.
 const int OFFSET = 0, FRAME = 6, FRICTION = 15, STIFFNESS = 20, PULL = 21, DAMPING = 22, SLIDING = 23, RECORD = 24;
 const int HELD = (NV + LANES - 1) / LANES;
-const int MOST_EDGES = 2 * (DIMS > 1 ? DIMS - 1 : 1);  // rows of a contact
+const int MOST_EDGES = 2 * (DIMS > 1 ? DIMS - 1 : 1);  // largest number of rows of a contact
 LEGGED_SHARED float record[SLOTS * RECORD];
 LEGGED_SHARED int directions[SLOTS], first_row[SLOTS], bodies[2 * SLOTS];
 LEGGED_SHARED float entry[3 * PLAIN];  // a row of friction or of a limit has up to three adjacent entries
@@ -40,8 +40,8 @@ auto impedance = [](const float* spring, float pos) {
 auto stiffness_of = [&](float inverse_weight, float impedance) {
     return 1.0f / most(inverse_weight * (1.0f - impedance) / impedance, TINY);
 };
-const int width = arrays.jacobian.shape[2];  // padded
-// Returns a pointer to the number of this world's row `row`; some arrays are padded.
+const int width = arrays.jacobian.shape[2];  // padded length of a row
+// Returns a pointer to the number of this world's row `row` in an array. Arrays may have room for different numbers of rows.
 auto at_row = [&](const auto& array, int row) { return array.data + (long long)world * array.shape[1] + row; };
 float* jacobian = arrays.jacobian.data + (long long)world * arrays.jacobian.shape[1] * width;
 auto put = [&](int row, int key, float stiffness, float reference, float loss) {
@@ -68,7 +68,7 @@ if (FRICTIONS) {
         if (!is) continue;
         const float* spring = arrays.dof_spring.data + i * SPRING;
         put(start + place, i, stiffness_of(dof_weights[i], impedance(spring, 0.0f)), -spring[1] * v_in[i], losses[i]);
-        // tells the solver which degree of freedom the friction belongs to
+        // The solver reads from `row_id` which degree of freedom the friction belongs to.
         if (start + place < ROWS) *at_row(arrays.row_id, start + place) = i;
         entry_dof[place] = i;
         for (int k = 0; k < 3; ++k) entry[3 * place + k] = k == 0 ? 1.0f : 0.0f;
@@ -118,7 +118,7 @@ if (LIMITS) {
 }
 const int plain = rows - start;
 
-// Each lane fills the record of one contact, which all lanes read later.
+// Each lane fills the record of one contact. Later, all lanes read all records.
 const int contacts = found < SLOTS ? found : SLOTS;
 for (int from = 0; from < contacts; from += LANES) {
     const int c = from + lane;
@@ -181,8 +181,8 @@ for (int from = 0; from < contacts; from += LANES) {
     arrays.contact_type.data[slot] = CONSTRAINT;
     arrays.contact_adhesion.data[slot] = 0.0f;
     int* addresses = arrays.contact_efc_address.data + slot * arrays.contact_efc_address.shape[1];
-    // Addresses may lie beyond the last row, since readers compare them with the number of rows. The first address is
-    // negative if the contact has no row, since readers test its sign.
+    // Readers compare addresses with the number of rows, so an address may lie beyond the last row. Readers test the sign of
+    // the first address, so it is negative if the contact has no row.
     for (int k = 0; k < needed; ++k) addresses[k] = k > 0 || row < ROWS ? row + k : -1;
 }
 for (int c = contacts + lane; c < SLOTS; c += LANES)
@@ -193,7 +193,8 @@ if (lane == 0) {
     arrays.nefc.data[world] = rows;
     if (!EQUALITIES) arrays.equalities.data[world] = 0;
     if (found > SLOTS) arrays.overflow.data[world] |= NARROWPHASE;
-    if (world == 0) arrays.nacon.data[0] = arrays.contact_dist.shape[0];  // all slots; empty slots have no rows
+    // All slots count as contacts; empty ones have no rows.
+    if (world == 0) arrays.nacon.data[0] = arrays.contact_dist.shape[0];
 }
 meet();
 const int unread = DENSE_FRICTION ? 0 : frictions;

@@ -5,8 +5,8 @@ them. Here each world has its own slots in mujoco-warp's contact arrays. Slots a
 from rows to contacts and from contacts to rows stay valid, so code that reads these arrays works unchanged.
 
 The lanes first test points of shapes against planes, pairs of spheres and capsules, and contact features against the height
-map. Then (contact_stage.h) they make the rows of dry friction, joint limits and contacts. The rows of equality constraints
-are mujoco-warp's own.
+map. Then (contact_stage.h) they make the rows of dry friction, joint limits and contacts. mujoco-warp makes the rows of
+equality constraints.
 """
 
 from collections.abc import Collection
@@ -43,7 +43,7 @@ FLAGS = mujoco.mjtDisableBit
 
 
 class ContactStage:
-    """Collision detection and constraint rows of all worlds, from poses and velocities in mujoco-warp's data."""
+    """Finds contacts and makes constraint rows in all worlds, from poses and velocities in mujoco-warp's data."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class ContactStage:
         randomized: Collection[str] = (),
         on_cells: TerrainContact | None = None,
     ) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` for which `why_not` is empty. `randomized` names the
-        arrays in which worlds differ; `on_cells` is the height-map collider, if the model stands on a height map. Warp's
-        current device must be that of `m` and `d`.
+        """Prepare the launch for a `model` that `why_not` accepts; `m` and `d` are mujoco-warp's model and data for it.
+        `randomized` names the arrays in which worlds differ. `on_cells` is the height-map collider, if there is a height map.
+        Warp's current device must be that of `m` and `d`.
         """
         self._m, self._d = m, d
         flags = model.opt.disableflags
@@ -82,7 +82,7 @@ class ContactStage:
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
         self.active_set = ActiveSet.of(d)
-        """Keys of the rows, with which the solver finds their states of the last step."""
+        """Keys of the rows, and their states in the last step, which the solver finds by key."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
         items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in features])
@@ -94,15 +94,14 @@ class ContactStage:
         self.constants = stage_constants(model, d.njmax, slots, dim, frictions, bool(limited.any()), bounces, dense_friction)
         """Constants of contact_stage.h."""
         self.kinds = bool(points), bool(round_pairs), bool(features)
-        """Flags for the kinds of candidates that the model has: points on planes, pairs of round shapes, and contact features
-        on the ground."""
+        """Flags for the kinds of candidates that the model has, as `stage_kernel` takes them."""
         self._kernel = stage_kernel(self.constants, *self.kinds)
         self._lanes = lanes_of(d.qacc.device)
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model with mujoco-warp's `m` and `d` is not supported, or an empty text. `randomized` names
-        the arrays in which worlds differ.
+        """Return the reason why `model` is not supported, or an empty text. `m` and `d` are mujoco-warp's model and data for
+        it; `randomized` names the arrays in which worlds differ.
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
@@ -141,7 +140,6 @@ class ContactStage:
         opt.disableflags = flags
 
     def _stage_arrays(self, model: mujoco.MjModel, m: Any, d: Any) -> Any:
-        """Return the arrays that the kernel reads and writes."""
         arrays, every = StageArrays(), self.contact_pairs
         timestep, safe = float(model.opt.timestep), contact_pairs.is_safe(model)
 
@@ -180,7 +178,6 @@ class ContactStage:
         return arrays
 
     def _candidates(self, model: mujoco.MjModel, d: Any, points: list, round_pairs: list[int], features: list) -> Any:
-        """Return the candidates for contacts."""
         items = Candidates()
         items.point_touch = wp.array([p.touch for p in points], dtype=int)
         items.point_kind = wp.array([p.kind for p in points], dtype=int)

@@ -3,10 +3,10 @@
 // degree of freedom only with those on its path to the root. A row of H is then as short as the path, and all degrees of
 // freedom of the same depth are eliminated at once. Otherwise the tree is treated as a single path.
 //
-// The first ROOT degrees of freedom are the root. The others are called limbs. The entries of the root's block of H and of
+// The first ROOT degrees of freedom are the root. All others are called limbs. The entries of the root's block of H and of
 // its part of g are called corners. Constants: ROOT (degrees of freedom that all paths begin with, at most 6), DEPTH (largest
 // length of a path), WIDTH (largest number of limbs of the same depth), SPLIT (the tree has branches), TRIANGLE (number of
-// the root's entries of H) and CORNER (the same with those of g).
+// the root's entries of H) and CORNER (number of the root's entries of H and g).
 
 #if defined(__CUDA_ARCH__)
 #define UNROLLED_ALONG _Pragma("unroll turns")
@@ -16,7 +16,7 @@
 #define EACH_CORNER(n) EVERY_CORNER(n) if (n < CORNER)
 #define OF_CORNER(values, n) values[0]
 const int LIMBS = NV > 32 && NV - ROOT > 32 ? 2 : 1, CORNERS = 1;
-// Return the value in the lane of a corner, and in the lane of a limb.
+// Return the value that the lane of corner n has, or that the lane of limb i has.
 auto from_corner = [&](const float* values, int n) { return __shfl_sync(0xffffffffu, values[0], n); };
 auto from_limb = [&](const float* values, int i) {
     if (NV <= 32) return __shfl_sync(0xffffffffu, values[0], i);
@@ -62,12 +62,12 @@ bool several = false;  // true if a row couples branches
 // With dampers, one more system is solved after the last iteration, by the same code: (M + h D) a = all forces. Its solution
 // is the acceleration that integrates the velocities, with dampers that act at the end of the step (MuJoCo's Euler).
 bool advancing = false;
-// Replaces the right-hand side in s and `shown` by the solution, which all lanes can read.
+// Replaces the right-hand side in s and `shown` by the solution. All lanes can read the solution in `shown`.
 auto solve = [&](auto tree) {
     constexpr bool branches = decltype(tree)::value;
     constexpr int height = branches ? DEPTH : NV, pitch = branches ? PITCH : LONG_PITCH;
-    // Few worlds have a row that couples branches. Their loops are not unrolled, so H is in slow memory: in registers, its
-    // long rows would displace data that every world needs.
+    // Few worlds have a row that couples branches. For these, loops are not unrolled and H is in slow memory: in registers,
+    // H's long rows would displace data that every world needs.
     [[maybe_unused]] constexpr int turns = branches || !SPLIT ? height : 1;
     float H[LIMBS][height], over[LIMBS], C[CORNERS] = {};
     // Compute the Hessian M + J^T diag(curvature) J, or M + h D.
@@ -128,7 +128,7 @@ auto solve = [&](auto tree) {
     UNROLLED_ALONG for (int t = height - 1; t >= ROOT; --t) {
         float* board = boards + (t & 1) * BOARD;
         EACH_LIMB(i) {
-            // every lane reads it: otherwise the compiler replaces it by H[depth], which does not stay in a register
+            // Every lane reads it: otherwise the compiler reads H[depth], and H leaves the registers.
             const float pivot = OF(H, i)[t];
             if ((branches ? OF(depth_of, i) : i) == t) {
                 float* row = board + (branches ? OF(place_of, i) * pitch : 0);
@@ -143,7 +143,7 @@ auto solve = [&](auto tree) {
             if (own < t) {
                 int from = 0, to = 1;
                 if (branches) {
-                    const int packed = arrays.below.data[t * NV + i];  // range of this depth's descendants of i
+                    const int packed = arrays.below.data[t * NV + i];  // places of i's descendants at this depth
                     from = packed & 0xff, to = packed >> 8;
                 }
                 ROLLED for (int n = from; n < to; ++n) {
@@ -164,7 +164,7 @@ auto solve = [&](auto tree) {
     }
     // Factorise the root, of which each lane has one corner, by the same formula. Then compute its solution in all lanes.
     float root[ROOT > 0 ? ROOT : 1], root_over[ROOT > 0 ? ROOT : 1];
-    meet();  // `shown` has been read, and is written below
+    meet();  // wait until all lanes have read `shown`, which is written below
     UNROLLED for (int k = ROOT - 1; k >= 0; --k) {
         const int row = k * (k + 1) / 2;
         root_over[k] = inverse(most(from_corner(C, row + k), TINY));

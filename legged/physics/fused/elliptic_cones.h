@@ -1,16 +1,17 @@
-// Elliptic friction cones (MuJoCo documentation, "Computation", and its `mj_constraintUpdate`). The first row of a contact
-// lies along its normal, and one more row along each direction of friction; the first row represents all of them. Let u be x
-// scaled by the friction coefficients, mu the coefficient of the first direction, softened by impratio, N = u_0 and T = |u_1,
-// u_2 ...|. In the dual cone N >= mu T there is no force. Where mu N + T <= 0, each row has its own force. In the zone
-// between, the cost is a quadratic function of N - mu T. Constants: ELLIPTIC (the model uses elliptic cones), ELLIPTIC_ROW
-// (MuJoCo's number of their row type).
+// Elliptic friction cones (MuJoCo documentation, "Computation", and its `mj_constraintUpdate`). A contact's first row lies
+// along its normal, and represents the contact; each other row lies along a direction of friction. Let mu be the friction
+// coefficient of the first direction, softened by impratio. Let u be x times mu in the first row, and x times the row's
+// friction coefficient in the other rows. Let N = u_0 and T = |u_1, u_2 ...|. Zone 0, the dual cone N >= mu T, has no force.
+// In zone 1, mu N + T <= 0, the force of each row depends on this row alone. In zone 2, between them, the cost is a quadratic
+// function of N - mu T. Constants: ELLIPTIC (the model has elliptic cones), ELLIPTIC_ROW (MuJoCo's number of their rows'
+// type).
 
 const int CONE_ROWS = ELLIPTIC ? ROWS : 1;
 // number of directions in the first row of a contact; -1 in its other rows; 0 in rows without a cone
 LEGGED_SHARED signed char directions[CONE_ROWS];
 LEGGED_SHARED float rubs[CONE_ROWS];  // factors that scale x to u
-LEGGED_SHARED float lean[CONE_ROWS];  // in the zone between: u / T, scaled again, in all rows but the first
-// in the zone between: curvature along N - mu T in the first row, and across it in the second
+LEGGED_SHARED float lean[CONE_ROWS];  // in zone 2, in rows of friction: u / T times `rubs`
+// in zone 2: curvature along N - mu T in the first row, and across it in the second
 LEGGED_SHARED float bent[CONE_ROWS];
 
 if (ELLIPTIC) EACH_ROW(r) {
@@ -22,13 +23,13 @@ if (ELLIPTIC) EACH_ROW(r) {
         const float soften = arrays.impratio_invsqrt.data[world % arrays.impratio_invsqrt.shape[0]];
         directions[r] = k == 0 ? n : -1;
         rubs[r] = k == 0 ? friction[0] * soften : friction[k - 1];
-        if (r - k + n > rows) { directions[r] = 0; D[r] = 0.0f; }  // part of the contact's rows did not fit
+        if (r - k + n > rows) { directions[r] = 0; D[r] = 0.0f; }  // not all rows of the contact fitted
     }
 }
 
 if (ELLIPTIC) meet();
 
-// Computes the forces of the contact that begins with row r. Returns its zone, as its state.
+// Computes the forces of the contact that begins with row r. Returns the contact's zone, which is its state.
 [[maybe_unused]] auto press = [&](int r) {
     const int n = directions[r];
     const float mu = rubs[r], N = mu * x[r];
@@ -82,9 +83,8 @@ if (ELLIPTIC) meet();
     second += along * (change * change + (mu * T - N) * mu * most(vv - Tv * Tv, 0.0f) / T);
 };
 
-// Returns a cone's contribution to the Hessian's entry (i, j) in the zone between, in addition to the curvature of its rows.
-// It adds the curvature along N - mu T. It subtracts the curvature across in the direction of sliding, where the cost has
-// none.
+// Returns what a cone in zone 2 adds to entry (i, j) of the Hessian, besides the curvature of the cone's rows: the curvature
+// along N - mu T, minus the curvature across it in the direction of sliding, in which the cost has no curvature.
 [[maybe_unused]] auto bend_of = [&](int r, int i, int j) {
     float one = 0.0f, other = 0.0f, lean_i = 0.0f, lean_j = 0.0f;
     with_row(r, [&](int, const float* row) { one = row[i]; other = row[j]; });

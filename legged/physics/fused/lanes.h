@@ -1,7 +1,7 @@
 // Code that all native sources share. On a GPU a warp of 32 threads ("lanes") computes a world; on the CPU one thread does.
 //
-// These files are bodies of a function, which `native_source` (native.py) concatenates: constants, this file, then others. A
-// macro has the same meaning in all of them, so it never needs to be undefined.
+// `native_source` (native.py) makes the body of a function from constants, this file and other files, in this order. A macro
+// has the same meaning in all files, so none is ever undefined.
 
 #if defined(__CUDA_ARCH__)
 // Memory that all lanes of a world share.
@@ -14,8 +14,7 @@ const int LANES = 32, lane = threadIdx.x & 31;
     for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
     return x;
 };
-// Computes the sums of four numbers over all lanes. After each exchange a lane continues with half of them; at the end all
-// sums are broadcast.
+// Computes the sums of four numbers over all lanes. In each of two exchanges, a lane gives away half of its numbers.
 [[maybe_unused]] auto sum_four = [&](float* x) {
     const bool upper = lane & 16, odd = lane & 8;
     for (int k = 0; k < 2; ++k) {
@@ -28,14 +27,14 @@ const int LANES = 32, lane = threadIdx.x & 31;
 };
 // Returns true if x is true in any lane.
 [[maybe_unused]] auto any = [](bool x) { return __any_sync(0xffffffffu, x) != 0; };
-// Appends the lanes that are `on` to a list of `count` elements, and updates `count`. Returns the place of this lane.
+// Appends all lanes that are `on` to a list of length `count`. Updates `count`, and returns this lane's place.
 [[maybe_unused]] auto rank = [&](bool on, int& count) {
     const unsigned which = __ballot_sync(0xffffffffu, on);
     const int place = count + __popc(which & ((1u << lane) - 1u));
     count += __popc(which);
     return place;
 };
-// Returns 1 / x for a normal number, accurate except for the last bit.
+// Returns 1 / x for a normal number; only the last bit may be wrong.
 [[maybe_unused]] auto inverse = [](float x) {
 #if defined(__CUDACC__)
     float y;

@@ -1,4 +1,4 @@
-"""Native sources of kernels: their constants, the file that all of them include, and their own files."""
+"""Native sources of kernels, put together from constants, a shared file, and a kernel's own files."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -25,7 +25,6 @@ def native_source(files: Iterable[str], constants: Mapping[str, Constant]) -> st
 
 
 def _defined(name: str, value: Constant) -> str:
-    """Return the line that defines a constant or a table."""
     if isinstance(value, tuple):
         return f"static constexpr int {name}[] = {{{', '.join(map(str, value))}}};\n"
     return f"constexpr {'bool' if isinstance(value, bool) else 'int'} {name} = {int(value)};\n"

@@ -8,18 +8,17 @@
 // that a model lacks.
 
 LEGGED_SHARED float centre[NB * 3], inertia[NB * OF_INERTIA], motion[NV * OF_MOTION], speed[NV];
-// Motions overwrite poses, which are not needed by then, so that a multiprocessor holds more worlds.
+// Motions overwrite poses, which are then no longer needed. This saves shared memory, so that more worlds run at once.
 const int POSES = 7 * NB + 6 * NJ, MOTIONS = OF_BODY * NB;
 LEGGED_SHARED float place[POSES > MOTIONS ? POSES : MOTIONS];
 float *pos = place, *quat = pos + 3 * NB, *anchor = quat + 4 * NB, *axis = anchor + 3 * NJ;
-// row of each body: first its velocity and acceleration, then the accumulated inertia and force of its subtree
+// row of each body: its velocity and acceleration, which the inertia and force of its subtree replace later
 float* of_bodies = place;
 const int CARRIED = 0, VELOCITY = 0, ACCELERATION = 10, FORCE = 10;
-// Offsets of a body's orientation, principal inertias and mass, before its inertia is computed in their place.
+// Offsets of a body's orientation, principal inertias and mass, until the body's spatial inertia replaces them.
 const int TURN = 0, MAIN = 4, MASS = 7;
 
-// Returns this world's row, of `length` floats, in an array of the model. An array has one row for all worlds, or one per
-// world.
+// Returns this world's row of `length` floats in a model array, which has one row for all worlds or one for each.
 auto row_of = [&](const auto& array, int length, bool varies) {
     const float* data = reinterpret_cast<const float*>(array.data);
     if (!varies) return data;
@@ -43,7 +42,7 @@ const float* q_in = arrays.qpos.data + (long long)world * arrays.qpos.shape[1];
 const float* v_in = arrays.qvel.data + (long long)world * arrays.qvel.shape[1];
 // number of bodies that a body carries, itself included; they have consecutive indices
 const int* subtree = arrays.body_subtree.data;
-// Unpack the integers that describe a body, and a joint.
+// Functions that unpack the integers that describe bodies and joints.
 auto parent_of = [](int packed) { return packed & 0xff; };
 auto first_of = [](int packed) { return (packed >> 8) & 0xff; };
 auto count_of = [](int packed) { return (packed >> 16) & 0xf; };
@@ -80,7 +79,7 @@ for (int level = 1; level <= DEPTH; ++level) {
         const int parent = parent_of(of_body), first = first_of(of_body), last = first + count_of(of_body);
         float p[3], q[4], moved[3];
         const int of_first = first < last ? arrays.joint_packed.data[first] : -1;
-        const bool floats = first < last && type_of(of_first) == FREE;  // such a body has no other joint
+        const bool floats = first < last && type_of(of_first) == FREE;  // a body with a free joint has no other joint
         if (floats) {
             const int at = address_of(of_first);
             for (int k = 0; k < 3; ++k) anchor[first * 3 + k] = p[k] = q_in[at + k];
@@ -189,7 +188,7 @@ EACH(b, NB) {
 // Motion that each degree of freedom causes in the bodies that it moves.
 EACH(i, NV) {
     float* out = motion + i * OF_MOTION;
-    const int packed = arrays.dof_packed.data[i];  // one look-up instead of a chain of them
+    const int packed = arrays.dof_packed.data[i];  // saves a chain of look-ups
     const int b = packed & 0xff, j = (packed >> 8) & 0xff, type = (packed >> 16) & 0xf, of_joint = packed >> 20;
     // axis of rotation in the body's frame, for a free or ball joint
     const int turning = type == FREE ? of_joint - 3 : of_joint;
@@ -236,7 +235,8 @@ for (int level = 1; level <= DEPTH; ++level) {
                 if (EQUALITIES) for (int k = 0; k < 18; ++k) turning_axes[from * 6 + k] = 0.0f;
                 from += 3;
             }
-            const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);  // three axes turn at once
+            // The three axes of a free or ball joint turn together.
+            const int to = from + (type == FREE || (BALLS && type == BALL) ? 3 : 1);
             for (int k = 0; k < 6; ++k) now[k] = v[k];
             for (int i = from; i < to; ++i) {
                 const float* s = motion + i * OF_MOTION;
@@ -337,7 +337,7 @@ EACH(i, NV) {
             const float* rest = ROW(qpos_spring, arrays.qpos0.shape[1]) + at;
             const int of_joint = packed >> 20, turning = type == FREE ? of_joint - 3 : type == BALL ? of_joint : -1;
             float bent = q_in[at + (type == FREE && turning < 0 ? of_joint : 0)] - rest[type == FREE && turning < 0 ? of_joint : 0];
-            if (BALL_SPRINGS && turning >= 0) {  // rotation vector from the rest orientation, in the body's frame
+            if (BALL_SPRINGS && turning >= 0) {  // compute the rotation vector from the rest orientation, in the body's frame
                 const int first = type == FREE ? 3 : 0;
                 float now[4], back[4], turn[4];
                 for (int k = 0; k < 4; ++k) { now[k] = q_in[at + first + k]; back[k] = k == 0 ? rest[first] : -rest[first + k]; }

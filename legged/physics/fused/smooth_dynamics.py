@@ -7,7 +7,7 @@ the chip. The algorithms are recursive Newton-Euler and composite rigid bodies (
 2008), in MuJoCo's coordinates: spatial vectors are (angular, linear) in world axes about a tree's centre of mass; inertias
 are (xx, yy, zz, xy, xz, yz, m * offset, m).
 
-The numbers of the model are read from mujoco-warp's own arrays, in which worlds may differ.
+Parameters are read from mujoco-warp's own model arrays, in which worlds may differ.
 """
 
 from collections.abc import Collection
@@ -40,32 +40,32 @@ UNKNOWN = {
     "adhesion": ("geom_adhesion",),
     "delayed controls": ("actuator_delay",),
 }
-"""Unsupported feature -> arrays of the model that are all zero without it."""
+"""Unsupported feature -> arrays of the model. They contain only zeros if the model lacks the feature."""
 COUNTED = {
     "nflex": "flexes",
     "nmocap": "mocap bodies",
     "na": "actuators with a state",
     "nplugin": "plugins",
 }
-"""Count of the model -> further unsupported feature, which is absent if the count is zero."""
+"""Count in the model -> unsupported feature. The count is zero if the model lacks the feature."""
 NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SPRING", "WARMSTART")
 """Stages that a model may disable in MuJoCo, but that are always computed here."""
 PUSHED = "xfrc_applied"
-"""Name of external forces among the arrays in which worlds differ."""
+"""Array of external forces. `randomized` contains this name if external forces act on bodies."""
 ROW_LENGTHS = {"OF_INERTIA": 11, "OF_MOTION": 7, "OF_BODY": 17}
-"""Row strides in shared memory for inertias, motion axes, and the quantities of bodies. Each is the number of entries,
-made odd so that lanes that read one row each use different banks."""
+"""Lengths of rows in shared memory: of inertias, of motion axes, and of other quantities of bodies. They are odd, so that
+lanes that read different rows use different memory banks."""
 MOST_BLOCKS = 32
-"""Largest number of blocks per multiprocessor. It limits the registers per lane, so that 4096 worlds run at once on an
-H100."""
+"""Number of blocks that a multiprocessor must be able to run at once. The compiler limits the registers of a lane
+accordingly, so that 4096 worlds run at once on an H100."""
 
 Vector10 = wp.types.vector(length=10, dtype=wp.float32)
 
 
 @wp.struct
 class DynamicsArrays:
-    """Arrays of the kernel. It reads its own tables and arrays of mujoco-warp's model and data under their names there, and
-    writes the arrays from `geom_xpos` on.
+    """Arrays of the kernel: its own tables, and arrays of mujoco-warp's model and data, which have the same names there. The
+    kernel writes those from `geom_xpos` on.
     """
 
     body_packed: wp.array[int]
@@ -175,7 +175,7 @@ def shared_bytes(model: mujoco.MjModel) -> int:
 
 
 def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
-    """Return the kernel for a set of `dynamics_constants`. It is launched for (worlds, lanes)."""
+    """Return the kernel for a set of `dynamics_constants`. Its launch dimension is (worlds, lanes)."""
     move_world = dynamics_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, MOST_BLOCKS))
@@ -196,18 +196,18 @@ def dynamics_function(constants: dict[str, int | bool]) -> Any:
 
 
 def has_dampers(model: mujoco.MjModel, randomized: Collection[str] = ()) -> bool:
-    """Return True if a joint of the model is damped, or may be, since `dof_damping` is in `randomized`."""
+    """Return True if a joint is damped in the model, or may be damped in a world because `dof_damping` is in `randomized`."""
     return bool(np.any(model.dof_damping)) or "dof_damping" in randomized
 
 
 class SmoothDynamics:
-    """Poses of shapes, centres of mass, motion axes, the mass matrix, and all forces except those of constraints, from joint
-    positions, velocities and controls.
+    """Computes poses of shapes, centres of mass, motion axes, the mass matrix, and all forces except constraint forces, from
+    joint positions, velocities and controls.
     """
 
     def __init__(self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> None:
-        """Prepare the launch for mujoco-warp's `m` and `d` of a `model` for which `why_not` is empty. `randomized` names the
-        arrays in which worlds differ. Warp's current device must be that of `m` and `d`.
+        """Prepare the launch for a `model` that `why_not` accepts; `m` and `d` are mujoco-warp's model and data for it.
+        `randomized` names the arrays in which worlds differ. Warp's current device must be that of `m` and `d`.
         """
         arrays = self.arrays = DynamicsArrays()
         tables = _trees(model) | _motors(model) | _joints(model)
@@ -225,8 +225,8 @@ class SmoothDynamics:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model is not supported, or an empty text. `randomized` has MuJoCo's names of the arrays in
-        which worlds differ.
+        """Return the reason why `model` is not supported, or an empty text. `randomized` names the arrays in which worlds
+        differ.
         """
         for words, names in UNKNOWN.items():
             if drawn := [name for name in names if name in randomized]:
@@ -280,11 +280,11 @@ def _why_not_motors(model: mujoco.MjModel, scalar: np.ndarray) -> str:
 
 
 def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return tables of the kinematic trees.
+    """Return tables of the bodies and of their kinematic trees.
 
-    `body_subtree` is the number of bodies that a body carries, itself included. `body_tree` is the index of its tree.
-    `body_packed` packs its parent, its first joint, its number of joints and its level below the world into one integer.
-    `tree_root` is the first body of each tree. A tree is a child of the world; trees without joints are left out, and
+    For each body, `body_subtree` is the number of bodies in its subtree, itself included; `body_tree` is the index of its
+    tree; `body_packed` packs its parent, its first joint, its number of joints and its level below the world into one
+    integer. For each tree, `tree_root` is its first body, a child of the world. Trees without joints are left out, and
     `body_tree` of their bodies is 0. `why_not` rejects models with more than 255 bodies or joints.
     """
     parent = model.body_parentid
@@ -318,14 +318,15 @@ def _motors(model: mujoco.MjModel) -> dict[str, np.ndarray]:
 
 
 def _one_motor(model: mujoco.MjModel) -> bool:
-    """Return True if each degree of freedom has at most one motor, and each motor the control with its own index."""
+    """Return True if each degree of freedom has at most one motor, and each motor uses the control with the motor's index."""
     joints = model.actuator_trnid[:, 0]
     return len(set(joints.tolist())) == model.nu and bool((model.actuator_ctrladr == np.arange(model.nu)).all())
 
 
 def _joints(model: mujoco.MjModel) -> dict[str, np.ndarray]:
-    """Return tables that pack several indices into one integer: for each joint its type, the start of its position and its
-    first degree of freedom; for each degree of freedom its body, its joint, the joint's type and its index within the joint.
+    """Return two tables that pack several numbers into one integer. `joint_packed` has the type of each joint, the index of
+    its position in qpos, and its first degree of freedom. `dof_packed` has the body of each degree of freedom, its joint, the
+    joint's type, and its index within the joint.
     """
     joint = model.dof_jntid
     place = np.arange(model.nv) - model.jnt_dofadr[joint]

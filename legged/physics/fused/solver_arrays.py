@@ -7,9 +7,9 @@ Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 
 @wp.struct
 class SolverArrays:
-    """Arrays of the solver. It reads its own tables and arrays of mujoco-warp's model and data. It writes the arrays from
-    `qacc` to `rounds`, `advance` if dampers are integrated implicitly, and in `last_rows` the final states of rows with a
-    `row_key`.
+    """Arrays of the solver: its own tables, and arrays of mujoco-warp's model and data. The solver writes the arrays from
+    `qacc` to `rounds`. If dampers are integrated implicitly, it writes `advance`. If rows have keys (`row_key`), it writes
+    their final states to `last_rows`.
     """
 
     dof_depth: wp.array[int]

@@ -2,9 +2,9 @@
 
 mujoco-warp launches a stage for every feature that a model might have: gravity compensation, external forces, muscles with
 lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing, which
-adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` names a feature
-of a model that it does not support. External forces on bodies (`xfrc_applied`) are applied if they were requested.
-`qfrc_applied`, sensors, and the poses of bodies, sites and cameras are not computed.
+adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` returns the first
+feature of a model that this step does not support. External forces on bodies (`xfrc_applied`) are applied if they were
+requested. `qfrc_applied`, sensors, and the poses of bodies, sites and cameras are not computed.
 """
 
 from collections.abc import Collection
@@ -36,7 +36,7 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
 
 @wp.struct
 class StateArrays:
-    """Arrays of the integration. It reads arrays of mujoco-warp's model and data, and writes those from `qpos` on."""
+    """Arrays of mujoco-warp's model and data that the integration reads. It writes those from `qpos` on."""
 
     timestep: wp.array[float]
     jnt_type: wp.array[int]
@@ -70,7 +70,7 @@ def put_three(to: wp.array2d[float], world: int, at: int, numbers: wp.vec3) -> N
 
 @wp.func
 def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None:
-    """Integrate the quaternion of a joint, which starts at `at` in qpos, and its three degrees of freedom."""
+    """Integrate a joint's quaternion, which starts at `at` in qpos, and its velocity, which starts at `dof` in qvel."""
     velocity, gain = three(of.qvel, world, dof), three(of.advance, world, dof)
     acceleration = three(of.qacc, world, dof)
     quat = wp.vec4(of.qpos[world, at], of.qpos[world, at + 1], of.qpos[world, at + 2], of.qpos[world, at + 3])
@@ -84,7 +84,7 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 
 @wp.func
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
-    """Integrate one joint by semi-implicit Euler. The world's first joint also sets the overflow flags.
+    """Integrate one joint by semi-implicit Euler. The call for joint 0 also sets the world's overflow flags.
 
     All reads precede all writes, so that they wait for memory together: the compiler moves no read ahead of a write. For a
     free joint this holds separately for its position and for its orientation.
@@ -127,16 +127,14 @@ def integrate(of: StateArrays):
 
 
 class TorqueStep:
-    """Launches, on mujoco-warp's arrays, of all parts of a step except contacts and constraint rows, which are made between
-    `begin` and `finish`.
-    """
+    """Launches a step, except contacts and constraint rows, which the caller computes between `begin` and `finish`."""
 
     def __init__(
         self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), active_set: ActiveSet | None = None
     ) -> None:
-        """Prepare the launches for mujoco-warp's `m` and `d` of a `model` for which `why_not` and `ConstraintSolver.why_not`
-        are empty. `randomized` names the arrays in which worlds differ; `active_set` holds the rows' states of the last step,
-        if they have keys. Warp's current device must be that of `m` and `d`.
+        """Prepare the launches for a `model` that this step and `ConstraintSolver` support; `m` and `d` are mujoco-warp's
+        model and data for it. `randomized` names the arrays in which worlds differ. `active_set` holds the row states of the
+        last step, if rows have keys. Warp's current device must be that of `m` and `d`.
         """
         self.dynamics = SmoothDynamics(model, m, d, randomized)
         self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), active_set=active_set)
@@ -149,17 +147,15 @@ class TorqueStep:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return the reason why a model is not supported, or an empty text. `randomized` has MuJoCo's names of the arrays in
-        which worlds differ.
+        """Return the reason why `model` is not supported, or an empty text. `randomized` names the arrays in which worlds
+        differ.
         """
         if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
             return "the model's integrator is not Euler"
         return SmoothDynamics.why_not(model, randomized)
 
     def begin(self) -> None:
-        """Compute the poses of shapes, the inputs of contacts, and all forces except constraint forces from qpos, qvel and
-        ctrl.
-        """
+        """Compute the inputs of contacts and constraint rows, and all other forces, from qpos, qvel and ctrl."""
         self.dynamics.launch()
 
     def finish(self) -> None:

@@ -1,6 +1,4 @@
-"""Elimination tree of the degrees of freedom: the order in which a linear system is solved, and the parts that can be solved
-in parallel.
-"""
+"""Elimination tree of the degrees of freedom. It tells which parts of a linear system can be solved in parallel."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,11 +9,11 @@ import numpy as np
 CONNECT, WELD, JOINT = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT"))
 SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 MOST_ROOT = 6
-"""Largest number of degrees of freedom in the root. Every lane solves for the root, so the root's entries must fit a lane's
-registers. With 6, the triangle and the right-hand side have no more entries than there are lanes."""
+"""Largest number of degrees of freedom in the root (`Tree.root`). Each lane holds one entry of the root's triangular matrix
+or right-hand side: with 6, these have 27 entries for 32 lanes. Every lane then solves for the root in its registers."""
 MOST_DOFS = 60
-"""Largest number of degrees of freedom for which mujoco-warp keeps dense Jacobian rows. A GPU lane can hold two, which would
-allow 64."""
+"""Largest number of degrees of freedom for which mujoco-warp keeps dense Jacobian rows. The solver would allow 64, because a
+GPU lane can hold two degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +25,9 @@ class Tree:
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Tree":
-        """Return the elimination tree of the mass matrix with the model's equality constraints. When a matrix with the
-        entries of both is eliminated from the last degree of freedom to the first, only entries that couple a degree of
-        freedom with its ancestors are non-zero (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
+        """Return the elimination tree of a matrix with the non-zero entries of the mass matrix and of the model's equality
+        constraints. If the matrix is eliminated from the last degree of freedom to the first, non-zero entries only arise
+        between a degree of freedom and its ancestors (Davis, Direct Methods for Sparse Linear Systems, 2006, section 4.1).
         """
         above: list[set[int]] = [set(_chain(model, i)) - {i} for i in range(model.nv)]
         for clique in _coupled(model):
@@ -44,7 +42,7 @@ class Tree:
 
     @property
     def depth(self) -> np.ndarray:
-        """(nv,) number of ancestors."""
+        """(nv,) number of ancestors of each degree of freedom."""
         depth = np.zeros(len(self.parent), dtype=int)
         for i, parent in enumerate(self.parent):
             depth[i] = depth[parent] + 1 if parent >= 0 else 0
@@ -82,10 +80,10 @@ class Tree:
     def tables(self) -> dict[str, np.ndarray]:
         """Return the tables of elimination.h.
 
-        For each degree of freedom: `dof_depth`, its depth; `dof_place`, its place among those of the same depth; `path`, its
-        path as a bit mask. For each depth: `depth_width`, the number of degrees of freedom. For each depth and degree of
-        freedom, (depths * nv,): `dof_path`, the element of its path at that depth; `below`, the range of places of its
-        descendants at that depth, with the first place in the lowest byte and the end in the next.
+        For each degree of freedom, `dof_depth` is its depth, `dof_place` its place among those of the same depth, and `path`
+        its path as a bit mask. For each depth, `depth_width` is the number of degrees of freedom. For each depth and degree
+        of freedom, (depths * nv,), `dof_path` is the element of its path at that depth, and `below` the range of places of
+        its descendants at that depth: the first place in the lowest byte, the end in the next byte.
         """
         nv, depth = len(self.parent), self.depth
         paths = [self.path(i) for i in range(nv)]
@@ -115,7 +113,7 @@ class Tree:
 
 
 def _chain(model: mujoco.MjModel, dof: int) -> list[int]:
-    """Return a degree of freedom and its ancestors in the mechanism."""
+    """Return a degree of freedom and its ancestors in the kinematic tree."""
     chain = []
     while dof >= 0:
         chain.append(int(dof))

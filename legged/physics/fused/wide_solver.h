@@ -2,12 +2,13 @@
 // friction pyramids, with the numbers of all worlds in vector registers. Worlds with fewer rows than others have empty rows,
 // and worlds that have converged wait for the others of their block. A block has the worlds from `start` to before `end`, at
 // most WIDE. Constants: WIDE, NV (degrees of freedom), ROWS (largest number of constraint rows), ENTRIES (stored entries of
-// the mass matrix), DAMPED (dampers are integrated implicitly), KNOWN (rows have keys by which their states of the last step
-// are found), FRICTION (there may be rows of dry friction), COUPLED (a row may move degrees of freedom of several branches).
-// Tables of the tree: PATH_START and PATH_LENGTH (NV each), the start and length in PATHS of each degree of freedom's path
-// from the root to itself; ENTRY_PLACE (ENTRIES), the place of each entry of the mass matrix among the entries of all paths.
+// the mass matrix), DAMPED (dampers are integrated implicitly), KNOWN (rows have keys, with which their states of the last
+// step are found), FRICTION (there may be rows of dry friction), COUPLED (a row may move degrees of freedom of several
+// branches). Tables of the tree: PATH_START and PATH_LENGTH (NV each), the start and length in PATHS of each degree of
+// freedom's path from the root to itself; ENTRY_PLACE (ENTRIES), the place of each entry of the mass matrix among the entries
+// of all paths.
 
-// One number per world, and one mask per world, in which all bits are set for true.
+// A Wide holds a number for each world. A Mask holds an integer for each world: -1 (all bits set) for true, 0 for false.
 typedef float Wide __attribute__((vector_size(4 * WIDE), may_alias));
 typedef int Mask __attribute__((vector_size(4 * WIDE), may_alias));
 const Wide ZERO = Wide{};
@@ -23,7 +24,7 @@ auto any_of = [](const Mask& mask) {
 
 int at[WIDE];  // indices of the worlds; the last world is repeated if there are too few
 int rows = 0;
-// numbers of rows, of equality rows, and of equality and dry friction rows, which come first
+// for each world: numbers of all rows, of equality rows, and of equality and dry friction rows together
 Mask own_rows, equalities, plain;
 for (int w = 0; w < WIDE; ++w) {
     at[w] = start + w < end ? start + w : end - 1;
@@ -34,7 +35,7 @@ for (int w = 0; w < WIDE; ++w) {
     plain[w] = equalities[w] + (FRICTION ? arrays.frictions.data[at[w]] : 0);
 }
 
-// Returns one world's number among those of all, as a reference, so that writing it does not read and write a whole register.
+// Returns a reference to world w's number. Writing to it does not read and write a whole register.
 auto of = [&](Wide& all, int w) -> float& { return reinterpret_cast<float*>(&all)[w]; };
 Wide J[ROWS][NV], D[ROWS], x[ROWS], force[ROWS], curvature[ROWS], jv[ROWS], least[ROWS], greatest[ROWS];
 Mask states[ROWS];
@@ -91,7 +92,7 @@ auto times_inertia = [&](const Wide* v, Wide* out) {
             total += row[t] * v[path[t]];
             out[path[t]] += row[t] * v[i];
         }
-        out[i] = total;  // rows below i add to it later
+        out[i] = total;  // the rows of i's descendants add to it later
     }
 };
 auto along_row = [&](int r, const Wide* v) {
@@ -105,8 +106,8 @@ for (int r = 0; r < rows; ++r) {
     x[r] += along_row(r, a);
     states[r] = Mask{} + UNKNOWN;
 }
-// Read the row states of the last step. After a reset there is no acceleration to start from, and they are not used. In this
-// file a state is 0 on the quadratic piece of the cost, -1 at the least force and 2 at the greatest. Both lists are ordered
+// Read the row states of the last step. They are not used after a reset, which sets the last acceleration to zero. In this
+// file a state is 0 on the quadratic piece of the cost, -1 at the least force and 2 at the greatest. Both steps' rows ascend
 // by key.
 auto last_rows = [&](int w) { return arrays.last_rows.data + (long long)at[w] * arrays.last_rows.shape[1]; };
 auto row_keys = [&](int w) { return arrays.row_key.data + (long long)at[w] * arrays.row_key.shape[1]; };
@@ -126,8 +127,8 @@ for (int w = 0; KNOWN && w < WIDE; ++w) {
     }
 }
 
-// Solves H s = g for a tree in which row i of H has entries for the path of i only; s holds g at first. The arguments return
-// the start, the length and the elements of a row. H = L^T diag(1 / over) L, from the leaves to the root.
+// Solves H s = g in place: s holds g at first. Row i of H has entries only for the path of i in a tree. The arguments are
+// functions that return a row's start, length and path elements. H = L^T diag(1 / over) L, from the leaves up.
 auto solve = [&](auto start_of, auto length_of, auto path_of) {
     for (int k = NV - 1; k >= 0; --k) {
         const int last = length_of(k) - 1;
@@ -170,8 +171,8 @@ auto add_tile = [&](auto tile_rows, auto tile_columns, const Wide (*of_rows)[ROW
     for (int q = 0; q < tall; ++q)
         for (int c = 0; c < broad; ++c) H[start_of(i + q) + t + c] = total[q][c];
 };
-// Adds the rows in `pushing`, times their curvature, to H. Three degrees of freedom are processed at once if they follow each
-// other on a path.
+// Adds the rows in `pushing`, times their curvature, to H. Takes three degrees of freedom at once if they are adjacent on a
+// path.
 auto add_rows = [&](auto start_of, auto length_of, auto path_of) {
     auto add_entries = [&](auto tall, const Wide (*of_rows)[ROWS], int i, int from, int to) {
         int t = from;
@@ -197,7 +198,7 @@ auto sparse_path = [](int i, int t) { return PATHS[PATH_START[i] + t]; };
 [[maybe_unused]] auto dense_path = [](int, int t) { return t; };
 
 Mask active = Mask{} - 1, rounds = Mask{};
-Wide alpha = ZERO;  // length of the last step; after a full step without changed states, the minimum is reached
+Wide alpha = ZERO;  // last step length; if it is 1 and no state changes, the minimum is reached
 for (int round = 0;; ++round) {
     // The first step goes to the minimum of the quadratic function that the states of the last step define.
     const bool guessing = KNOWN && round == 0 && any_of(guess);
@@ -216,7 +217,7 @@ for (int round = 0;; ++round) {
         }
         force[r] = low ? least[r] : high ? greatest[r] : pull;
         curvature[r] = low | high ? ZERO : D[r];
-        const Mask state = low - 2 * high;  // a mask that is true is -1
+        const Mask state = low - 2 * high;  // true is -1 in a mask
         changed |= state != states[r];
         states[r] = state;
         if (!any_of((force[r] != 0.0f) | (curvature[r] != 0.0f))) continue;
@@ -247,7 +248,7 @@ for (int round = 0;; ++round) {
         add_rows(sparse_start, sparse_length, sparse_path);
         solve(sparse_start, sparse_length, sparse_path);
     }
-    // Along the step, compute the derivative slope + alpha * bend of the inertial part, and J s for every row.
+    // Compute J s for every row. The inertial cost has the derivative slope + alpha * bend along the step.
     times_inertia(s, Ms);
     Wide slope = ZERO, bend = ZERO, length = ZERO, decrement = ZERO;
     for (int i = 0; i < NV; ++i) {
@@ -256,11 +257,11 @@ for (int round = 0;; ++round) {
         length += s[i] * s[i];
         decrement -= s[i] * grad[i];
     }
-    // Continue only where the step gains enough, which is false for NaN.
+    // Continue only in worlds in which the step gains enough. For NaN, the comparison is false.
     active &= scale * 0.5f * decrement >= (whole ? ZERO - INFINITE : ZERO + tolerance);
     if (!any_of(active)) break;
     for (int r = 0; r < rows; ++r) jv[r] = along_row(r, s);
-    // The line search need not reach the minimum: the next iteration reduces the rest of the slope. These are squares:
+    // The line search may stop early, since the next iteration reduces the slope further. `flat` is a squared slope.
     const Wide least_slope = tolerance * tolerance * ls_tolerance * ls_tolerance * length / (scale * scale);
     const Wide slope_left = ENOUGH * ENOUGH * decrement * decrement;
     const Wide flat = least_slope > slope_left ? least_slope : slope_left;
@@ -281,7 +282,7 @@ for (int round = 0;; ++round) {
         low = (searching & (first < 0.0f)) ? alpha : low;
         high = (searching & ~(first < 0.0f)) ? alpha : high;
         const Wide next = alpha - first / second, change = next - alpha;
-        searching &= ~((change < 0.0f ? -change : change) <= 1e-7f * alpha);  // limit of float32
+        searching &= ~((change < 0.0f ? -change : change) <= 1e-7f * alpha);  // float32 resolves no smaller change
         const Mask outside = (high > 0.0f) & ((next <= low) | (next >= high));
         alpha = searching ? (outside ? 0.5f * (low + high) : next) : alpha;
     }

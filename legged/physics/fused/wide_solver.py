@@ -34,7 +34,7 @@ def wide_constants(
         rows: largest number of constraint rows.
         damped: True if dampers are integrated implicitly.
         friction: True if there are rows of dry friction.
-        known: True if rows have keys by which their states of the last step are found.
+        known: True if rows have keys, with which the solver finds their states of the last step.
     """
     nv = len(tree.parent)
     paths = [tree.path(i) for i in range(nv)]
@@ -58,9 +58,7 @@ def fits_wide(nv: int, rows: int) -> bool:
 
 
 def wide_function(constants: dict[str, Constant]) -> Any:
-    """Return the device function of the kernel, which computes one block: the worlds from `start` to `end - 1`, at most
-    `WIDE`.
-    """
+    """Return the kernel's device function, which computes one block: up to `WIDE` worlds from `start` on, all before `end`."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_block(
@@ -77,9 +75,7 @@ def wide_function(constants: dict[str, Constant]) -> Any:
 
 
 def wide_kernel(constants: dict[str, Constant]) -> Any:
-    """Return the kernel for a set of `wide_constants`. It is launched with dimension (blocks,) for the worlds from
-    `first` to `end - 1`.
-    """
+    """Return the kernel for `wide_constants`, of dimension (blocks,). It computes the worlds `first` to `end - 1`."""
     solve_block = wide_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False)

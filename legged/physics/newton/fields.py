@@ -24,8 +24,8 @@ from legged.physics.warp.randomize_kernels import Redraws, Variants
 MOTORS = ("motor_strength", "actuator_gain", "torque_limit")
 """Fields of the motors, which convert controls to torques outside the solver."""
 CENTRES, BASE_CENTRE = "body_com", "base_com"
-"""Newton's own centres of mass, and the base's centre of mass that converts velocities. Both follow the solver's
-`body_ipos`."""
+"""Names here for Newton's own centres of mass, and for the base's centre of mass with which velocities are converted. Both
+must follow changes of the solver's `body_ipos`."""
 
 
 class _SolversScene(Scene):
@@ -42,13 +42,13 @@ class _SolversScene(Scene):
 
 
 class SolverFields:
-    """Arrays of the solver and of the motors that fields change."""
+    """Changes arrays of the solver and of the motors for randomised fields."""
 
     def __init__(
         self, scene: Scene, model: mujoco.MjModel, simulation: Simulation, base_com: Tensor, fields: Collection[str]
     ) -> None:
-        """Prepare for `fields` of the robot whose MuJoCo model is `model`. `base_com` (N, 3) is the centre of mass that
-        converts the base's velocities. Warp's current device must be that of the simulation.
+        """Prepare to randomise `fields`. `model` is the robot's MuJoCo model. `base_com` (N, 3) is the base's centre of mass,
+        with which its velocities are converted. Warp's current device must be that of the simulation.
         """
         solver: Any = simulation.solver
         self._m, self._d, worlds, device = solver.mjw_model, solver.mjw_data, len(base_com), base_com.device
@@ -94,14 +94,13 @@ class SolverFields:
             mjw.set_const(self._m, self._d)
 
     def _with_centres(self, made: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the arrays `made`. If bodies' centres of mass are among them, add the arrays that depend on these."""
+        """Return `made`. If it contains the bodies' centres of mass, add the other arrays that hold them."""
         if "body_ipos" not in made:
             return dict(made)
         centres = made["body_ipos"]
         return {**made, CENTRES: centres[:, self._body_order], BASE_CENTRE: centres[:, self._base]}
 
     def prepare(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
-        """Prepare the launches of `redraw`."""
         self._redraws = []
         for of_motors, model in self._models.items():
             names = changed_arrays([name for name in fields if (name in MOTORS) == of_motors])
@@ -114,7 +113,6 @@ class SolverFields:
             launch.launch(mask)
 
     def set_variants(self, values: Mapping[str, Tensor]) -> None:
-        """Derive the constants of the model variants."""
         made = self._with_centres(self._models[False].variants(values))
         if self._variants is None:
             self._variants = Variants({name: (array, self._arrays[name]) for name, array in made.items()})
@@ -122,6 +120,6 @@ class SolverFields:
             self._variants.replace(made)
 
     def choose(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy the variants `chosen` (N,) into the worlds of `mask` (N,)."""
+        """Copy into each world of `mask` (N,) the variant with its index in `chosen` (N,)."""
         if self._variants is not None:
             self._variants.launch(mask, chosen)

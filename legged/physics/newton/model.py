@@ -29,9 +29,9 @@ class Layout:
     shapes: np.ndarray
     """(S,) indices of the collision shapes, in the robot's order."""
     root_q: int
-    """First coordinate of the free joint: position, then orientation (x, y, z, w)."""
+    """Index of the free joint's first coordinate. Its coordinates are position, then orientation (x, y, z, w)."""
     root_qd: int
-    """First velocity of the free joint: linear velocity of the base's centre of mass, then angular velocity, world frame."""
+    """Index of the free joint's first velocity. Linear velocity of the base's centre of mass, then angular, world frame."""
     dof_q: np.ndarray
     """(D,) indices of the joints' coordinates, in the robot's order."""
     dof_qd: np.ndarray
@@ -64,14 +64,14 @@ def build_newton_model(
     robot: Robot, setup: SolverSetup, sim: SimConfig, num_envs: int, terrain: Terrain | None, device: Any
 ) -> tuple[newton.Model, Layout]:
     """Return a model of N robots from the robot's MJCF, and its layout. All robots share one ground: a plane, or the height
-    map as one height field whose steps are ramps one cell wide. If the height-map collider replaces the
-    height field (`uses_cell_collider`), a plane far below is a placeholder. `device` is a Warp device.
+    map as one height field whose steps are ramps one cell wide. With the height-map collider (`uses_cell_collider`), the
+    ground is only a placeholder, a plane far below. `device` is a Warp device.
 
     Raises:
         ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
     """
     world = _builder(setup)
-    # Collision types are written in the model, and Newton interprets them when it reads the model.
+    # Newton reads collision types from the MJCF.
     source = robot_source(robot, sim.self_collisions)
     try:
         world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
@@ -85,7 +85,7 @@ def build_newton_model(
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
-    # The ground is not part of a world, because within one MJCF without self-collisions, nothing would collide with it.
+    # The ground is not part of a world: without self-collisions, shapes of the same world do not collide.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs
@@ -107,7 +107,7 @@ def uses_cell_collider(setup: SolverSetup, sim: SimConfig) -> bool:
 
 
 def _builder(setup: SolverSetup) -> newton.ModelBuilder:
-    """Return an empty builder with the solver's attributes and with MuJoCo's. The MJCF gives the values of the latter."""
+    """Return an empty builder with the solver's attributes, and with MuJoCo's attributes, which the MJCF sets."""
     builder = newton.ModelBuilder()
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     if setup.register is not None:
@@ -117,7 +117,7 @@ def _builder(setup: SolverSetup) -> newton.ModelBuilder:
 
 def _add_height_field(scene: newton.ModelBuilder, terrain: Terrain, cfg: newton.ModelBuilder.ShapeConfig) -> None:
     ground = terrain.height_map
-    heights = lattice_heights(ground).T  # rows lie along y
+    heights = lattice_heights(ground).T  # the row index counts along y
     half = [0.5 * (n - 1) * ground.cell for n in heights.shape]
     field = newton.Heightfield(heights, *heights.shape, hx=half[1], hy=half[0])
     middle = (ground.origin[0] + half[1], ground.origin[1] + half[0], 0.0)

@@ -20,8 +20,8 @@ from legged.physics.warp.physics import WarpPhysics
 
 
 class NewtonPhysics(WarpPhysics):
-    """N worlds in one of Newton's solvers (`sim.solver`). The task's state is a copy in the task's conventions: it is read
-    after every step, and written back by resets and pushes.
+    """N worlds in one of Newton's solvers (`sim.solver`). `qpos` and `qvel` are a copy of Newton's state in MuJoCo's layout.
+    Steps update the copy; resets and pushes write it back.
     """
 
     _state_io: NewtonStateIO
@@ -144,7 +144,7 @@ class NewtonPhysics(WarpPhysics):
             self._solvers_fields().choose(mask, chosen)
 
     def _solvers_fields(self) -> SolverFields:
-        """Return the arrays of the solver that fields change; create them on the first call."""
+        """Return the object that changes the solver's arrays. The first call creates it."""
         if self._fields is None:
             base_com, robot = self._state_io.base_com, self._scene
             self._fields = SolverFields(robot, self.model, self._simulation, base_com, self._randomized)
@@ -165,6 +165,5 @@ class NewtonPhysics(WarpPhysics):
         self._notify(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def _notify(self, changed: newton.ModelFlags) -> None:
-        """Notify the solver of changed model arrays."""
         with self._on_device():
             self._simulation.solver.notify_model_changed(changed)

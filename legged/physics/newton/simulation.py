@@ -51,7 +51,7 @@ class Simulation:
                 self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
             )
         with warnings.catch_warnings():
-            # Newton warns if MuJoCo's version is not 3.17. The engine tests run with the installed version.
+            # Newton warns if MuJoCo's version is not 3.17. Ignore this: the engine tests run with the installed version.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
         if terrain is not None and uses_cell_collider(setup, sim):
@@ -66,8 +66,7 @@ class Simulation:
         self.lost_bits = 1
         """Bits of `lost` that mean that contacts or rows were dropped."""
         self._pushes: list[Any] | None = None
-        """External forces on bodies, the indices of the bodies, and the number of bodies per world; None without external
-        forces."""
+        """External forces, the bodies' indices, and the number of bodies in a world; None without external forces."""
         self._observables = self._request()
         if self._observables is None or setup.springs is not None:
             self.force = wp.zeros(capacity, dtype=wp.spatial_vector)
@@ -86,7 +85,7 @@ class Simulation:
         TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
 
     def _request(self) -> SolverBase.Observables | None:
-        """Return the observables that the solver reports for each step in addition to the state."""
+        """Return the arrays that the solver fills in each step besides the state; None if there are none."""
         solver, kinds = self.solver, set()
         if self.setup.springs is None:
             kinds.add(solver.ObservableKind.CONTACT_F)

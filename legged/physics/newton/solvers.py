@@ -20,7 +20,7 @@ from legged.config.schema import SimConfig
 
 @dataclass(frozen=True)
 class SolverSetup:
-    """Construction and stepping of one of Newton's solvers."""
+    """Settings for one of Newton's solvers: its construction and its steps."""
 
     make: Callable[[newton.Model, SimConfig], SolverBase]
     substeps: int = 1
@@ -47,8 +47,8 @@ class SolverSetup:
 
     @property
     def friction_factor(self) -> float:
-        """Factor on the robot's friction. With the ground's friction 0 and a factor of 2, the mean is the robot's own
-        friction. Between two shapes of the robot, friction is then doubled.
+        """Factor on the friction of the robot's shapes. It is 2 if the solver averages friction: the ground's friction is
+        then 0, and the mean is the robot's own friction. Friction between two shapes of the robot is doubled, too.
         """
         return 2.0 if self.averages_friction else 1.0
 
@@ -69,7 +69,7 @@ def _mujoco(model: newton.Model, sim: SimConfig) -> SolverMuJoCo:
         njmax=sim.njmax,
         kinematic_switchable_roots=False,  # otherwise every robot has a weld that is never used
     )
-    solver.mjw_model.opt.warn_overflow = 0  # `refresh` counts overflows; a warning would be printed by each thread
+    solver.mjw_model.opt.warn_overflow = 0  # `refresh` reports overflows; a warning would come from each thread
     return solver
 
 
@@ -79,14 +79,13 @@ def _steel(model: newton.Model, sim: SimConfig) -> SolverSteel:
         enable_joint_limits=True,
         joint_limit_activation_gap=0.1,  # [rad]; by default every joint limit takes a row in every step
         articulation_constraint_max=sim.njmax,
-        warn_constraint_overflow=False,  # `refresh` counts overflows
+        warn_constraint_overflow=False,  # `refresh` reports overflows
     )
 
 
 def _kamino(model: newton.Model, sim: SimConfig) -> SolverKamino:
     config = SolverKamino.Config(use_collision_detector=False)
-    # The default tolerances are a hundred times smaller; they take twice as long and change the standing height by a
-    # micrometre.
+    # The default tolerances, a hundred times smaller, double the time and change the standing height by a micrometre.
     config.padmm.primal_tolerance = config.padmm.dual_tolerance = config.padmm.compl_tolerance = 1e-4
     return SolverKamino(model, config)
 
@@ -100,15 +99,15 @@ SOLVERS = {
     "mujoco": SolverSetup(_mujoco, own_contacts=True),
     "steel": SolverSetup(_steel, gap=0.01, register=SolverSteel.register_custom_attributes),
     "kamino": SolverSetup(_kamino, gap=0.01, register=SolverKamino.register_custom_attributes),
-    # With 4 or 8 substeps the feet chatter and slide apart, and the robot lies down within two seconds. The mass matrix is
-    # computed once per physics step: computing it in every substep takes nine tenths of the time.
+    # With 4 or 8 substeps the feet chatter and slide apart, and the robot collapses within two seconds. The mass matrix is
+    # computed once per physics step; in every substep, it would take nine tenths of the time.
     "featherstone": SolverSetup(
         lambda model, sim: SolverFeatherstone(model, angular_damping=0.0, update_mass_matrix_interval=FEATHERSTONE_SUBSTEPS),
         substeps=FEATHERSTONE_SUBSTEPS,
         springs=SPRINGS,
     ),
-    # Joints are springs too: at the default of 1e4 N/m the robot sags in them by centimetres, and with 20 substeps it sinks
-    # to 0.41 m within a second.
+    # In this solver joints are springs, too. With their default stiffness of 1e4 N/m they give way by centimetres. With 20
+    # substeps, the robot sinks to 0.41 m within a second.
     "semi_implicit": SolverSetup(
         lambda model, sim: SolverSemiImplicit(model, angular_damping=0.0, joint_attach_ke=1e5, joint_attach_kd=400.0),
         substeps=50,
@@ -117,8 +116,8 @@ SOLVERS = {
     ),
     # Friction acts against slip within one substep only. Without contacts that remember where they began ("sticky"), the feet
     # slide apart within a second for any number of substeps and iterations. With one substep the robot diverges. With 4
-    # substeps of 8 iterations instead of 8 substeps of 4, shapes that are pushed out of the ground hop off it, and walking
-    # takes six times the power.
+    # substeps of 8 iterations instead of 8 substeps of 4, shapes that penetrate the ground bounce off it, and walking takes
+    # six times the power.
     "xpbd": SolverSetup(
         lambda model, sim: SolverXPBD(model, iterations=4),
         substeps=8,

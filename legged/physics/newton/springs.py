@@ -42,8 +42,8 @@ def spring_forces(
     slope: float,
     force: wp.array[wp.spatial_vector],
 ):
-    """Compute the force on the first shape of each contact, by the contact law of Newton's solvers with springs. One thread
-    per contact.
+    """Compute the force on the first shape of each contact, by the contact law of those solvers whose contacts are springs.
+    One thread per contact.
 
     The spring force is proportional to depth, and the damper acts against approach. Friction opposes sliding in proportion to
     its speed, up to Coulomb's limit with the mean friction coefficient.
@@ -74,7 +74,7 @@ def launch_spring_forces(
     springs: tuple[float, float, float],
     force: wp.array,
 ) -> None:
-    """Write `force`, the force on the first shape of each contact, world frame [N], for the body poses and velocities of
+    """Write the force on the first shape of each contact, world frame [N], to `force`, for the body poses and velocities in
     `state`. `springs` are stiffness [N/m], damping [N s/m] and friction slope [N s/m].
     """
     wp.launch(

@@ -1,8 +1,8 @@
 """Conversion between Newton's arrays and those of the task: conventions of states, and contact forces by shape.
 
-Newton's quaternions are (x, y, z, w). It has the linear velocity of a body's centre of mass, and both velocities in the world
-frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear velocity is that of the base's
-origin in the world frame, and the angular velocity is in the base frame.
+Newton's quaternions are (x, y, z, w). Its linear velocity is that of the body's centre of mass, and both its velocities are
+in the world frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear velocity is that of the
+base's origin in the world frame, and the angular velocity is in the base frame.
 """
 
 from typing import Any
@@ -131,8 +131,8 @@ def add_shape_forces(
 
 @wp.kernel
 def flag_lost_contacts(count: wp.array[int], capacity: int, overflow: wp.array[int]):
-    """Set every world's flag if the pool of contacts has overflowed: all worlds share it, so each may have lost contacts. One
-    thread per world.
+    """Set the flags of all worlds if the pool of contacts that they share has overflowed, because each may have lost
+    contacts. One thread per world.
     """
     if count[0] > capacity:
         overflow[wp.tid()] = 1
@@ -159,9 +159,7 @@ class NewtonStateIO(RobotStateIO):
         robot: Robot,
         state: RobotState,
     ) -> None:
-        """Prepare the launches. `task` holds the task's qpos, qvel and ctrl; the arguments after it belong to the task too.
-        Warp's current device must be that of the arrays.
-        """
+        """Prepare the launches. `task` is the task's qpos, qvel and ctrl. Warp's current device must be theirs."""
         self._qpos, self._qvel, self._torques = task
         count, layout = len(overflowed), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)
@@ -211,8 +209,8 @@ class NewtonStateIO(RobotStateIO):
         wp.launch(put_states, dim=len(self._qpos), inputs=inputs, outputs=[self._joint_q, self._joint_qd])
 
     def note_lost_contacts(self) -> None:
-        """Record until the next refresh that this step lost contacts, because the pool of contacts was full or the solver set
-        its flags. This clears the solver's flags.
+        """Record, until the next refresh, which worlds may have lost contacts in this step: all worlds if the pool of
+        contacts was full, and those whose flags the solver has set. Clear the solver's flags.
         """
         simulation, contacts = self._simulation, self._simulation.contacts
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_max]

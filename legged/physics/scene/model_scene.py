@@ -12,7 +12,7 @@ from legged.physics.scene.scene import GroundShapes, Scene, set_options
 
 
 class ModelScene(Scene):
-    """A model as its file describes it, contacts included; only the solver options come from the configuration."""
+    """A model as its file describes it, including contacts. Only the solver options come from the configuration."""
 
     def __init__(self, path: Path | str) -> None:
         """Use the MJCF file at `path`, which is read when the model is built."""
@@ -24,11 +24,11 @@ class ModelScene(Scene):
         effect.
 
         Raises:
-            ConfigError: MuJoCo cannot read the file, or it has state that the engines do not keep per world.
+            ConfigError: MuJoCo cannot read the file, or its model has state that the engines do not keep for each world.
         """
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", ".* is deprecated")  # the user may be unable to change the file
+                warnings.filterwarnings("ignore", ".* is deprecated")  # files with deprecated elements still work
                 spec = mujoco.MjSpec.from_file(str(self.path))
                 set_options(spec.option, sim)
                 model = spec.compile()

@@ -12,15 +12,15 @@ from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 UNTOUCHED = 1 << 30
-"""Collision type of a geom that collides with nothing, and yet is not removed as decoration."""
+"""Collision type of a geom that collides with nothing. Without a collision type, MuJoCo would discard it as visual."""
 ROBOT, GROUND = 1, 2
 """Collision types: one bit each in MuJoCo's contype and conaffinity."""
 
 
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
-    """Return the robot alone. Whatever its file says, its shapes collide with the ground. They collide with each other only
-    with `self_collisions`, and never with those of neighbouring bodies. Contacts use the robot's friction, which
-    randomisation changes, and its motors have the rotor inertias of `robot`.
+    """Return the robot without a ground. Some settings replace those of its file: its shapes collide with the ground, and,
+    with `self_collisions`, with each other unless their bodies are neighbours. Contacts with the ground use the friction of
+    the robot's shapes, because it can be randomised. Joints have the rotor inertias of `robot`.
     """
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):
@@ -31,15 +31,15 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
             if geom.priority < 1:  # without priority, MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
     if not self_collisions:
-        for pair in list(spec.pairs):  # explicit pairs collide whatever their types are
+        for pair in list(spec.pairs):  # explicit pairs collide whatever their collision types are
             spec.delete(pair)
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
     return spec
 
 
 def robot_source(robot: Robot, self_collisions: bool) -> str:
-    """Return the robot as MJCF for an engine that parses MJCF: the path of the robot's file, or a text if `robot_spec`
-    changes the robot.
+    """Return the robot for an engine that parses MJCF: the path of the robot's file, or an MJCF text if the file alone does
+    not describe the robot as `robot_spec` does.
     """
     own = robot_spec_of(robot.model_path)
     before = _settings(own, robot)
@@ -58,17 +58,12 @@ def body_names(robot: Robot) -> list[str]:
 
 
 def _settings(spec: mujoco.MjSpec, robot: Robot) -> tuple[dict[str, tuple[int, int, int, int]], list[float]]:
-    """Return the settings that `robot_spec` may change: the collision settings of each shape, and the rotor inertias of the
-    joints.
-    """
     shapes = {geom.name: (geom.contype, geom.conaffinity, geom.priority, geom.condim) for geom in spec.geoms}
     return shapes, [float(spec.joint(name).armature) for name in robot.joint_names]
 
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
-    """Return the range of the contact sensors' columns in sensordata: its start, and its end, which is excluded. Each shape
-    has 3 adjacent columns.
-    """
+    """Return the contact sensors' first column in sensordata, and the one after their last. Each shape has 3 columns."""
     start = int(model.sensor(f"contact_{robot.shape_names[0]}").adr[0])
     return start, start + 3 * len(robot.shape_names)
 
@@ -113,5 +108,5 @@ class RobotScene(Scene):
         return spec.compile()
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:
-        """Return the robot's collision shapes (S,), in the robot's order. Contacts with the ground have their friction."""
+        """Return the robot's collision shapes (S,), in the robot's order. Contacts with the ground use their friction."""
         return np.array([model.geom(name).id for name in self.robot.shape_names])

@@ -17,9 +17,9 @@ class Scene(ABC):
     """Contents of one world."""
 
     name: str
-    """Name in error messages: a folder or a file."""
+    """Robot's folder or model's file, for error messages."""
     robot: Robot | None = None
-    """Robot with a floating base and feet; None without such a robot."""
+    """Robot with a floating base and feet; None if the scene has no such robot."""
     terrain: Terrain | None = None
     """Terrain; None for a plane."""
 
@@ -44,8 +44,7 @@ class Scene(ABC):
 def set_options(option: mujoco.MjOption, sim: SimConfig) -> None:
     """Overwrite the solver options of a model with those of `sim`.
 
-    The integrator is semi-implicit Euler. It is sufficient for torques from an explicit PD law, and it splits a step exactly
-    into torque and dynamics.
+    The integrator is semi-implicit Euler, which suffices for torques that depend only on the state at a step's start.
     """
     option.timestep = sim.dt
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER

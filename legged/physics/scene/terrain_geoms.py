@@ -11,11 +11,12 @@ from legged.terrain.height_map import CORNERS, HeightMap
 from legged.terrain.terrain import Terrain
 
 DEPTH = 20.0
-"""Depth of all geoms below the lowest point of the map [m]. It is so large that nothing slips between two geoms. Where
-points of a height field are sunk to this depth, its flanks lean by less than 1 mm for each 0.2 m of a face."""
+"""Distance from the lowest point of the map to the bottom of all geoms [m]. It is so large that nothing slips between two
+geoms. Unused points of a height field lie at the bottom. The flanks that lead down to them are nearly vertical: they deviate
+by less than 1 mm for each 0.2 m of height."""
 SKIN = 0.05
-"""Distance by which colliding height fields lie below the ground, measured along the ground's normal [m]. MuJoCo's margin
-makes them collide at this distance above their surface.
+"""Distance of a colliding height field below the ground, along the ground's normal [m]. The geom has a margin of this size,
+so that shapes collide with it at the height of the ground.
 
 MuJoCo treats a height field as adjacent prisms, each of which is solid down to its base. A small foot that sinks below their
 tops at an impact is pushed out of one prism sideways into the next, and gets stuck. The margin keeps the foot above the
@@ -37,13 +38,13 @@ def add_terrain(
     """Add a terrain to the world body: boxes where it consists of steps, and one height field per tile where it is smooth.
     Return the geoms, which are named terrain_<number>.
 
-    The surface is that of the height map, except that a twisted cell becomes two triangles instead of a bilinear patch. A
-    shape that collides with a height field meets a surface `SKIN` above the geom, with edges of that radius.
+    The surface is that of the height map, except that a twisted cell becomes two triangles instead of a bilinear patch.
+    Shapes collide with a height field at the distance `SKIN` above its geom, and edges are rounded with this radius.
 
     Args:
         spec: model that the geoms are added to.
         terrain: the terrain.
-        rows: adjacent rows of tiles; all by default. The border is included next to the first and last row of the terrain.
+        rows: adjacent rows of tiles; all by default. The terrain's first and last row include the adjoining border.
         cols: columns of tiles, in the same way.
         material: name of a material in `spec`.
         collide: False for geoms that are only rendered.
@@ -54,7 +55,7 @@ def add_terrain(
     add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide), skin, collide)
     length, width, border = (round(x / ground.cell) for x in (*terrain.tile_size, terrain.border))
     count = terrain.origins.shape[:2]
-    # A slope may be joined to the border, whose first cells then slope too. The outer tiles include these cells.
+    # Where a slope meets the border, the border's first cells slope too. The outer tiles include these cells.
     x_edges, y_edges = (_edges(n, side, border) for n, side in zip(count, (length, width), strict=True))
     chosen = [range(n) if picked is None else picked for n, picked in zip(count, (rows, cols), strict=True)]
     for r in chosen[0]:
@@ -79,8 +80,8 @@ def add_terrain(
 def add_height_field(
     spec: mujoco.MjSpec, ground: HeightMap, material: str | None = None, collide: bool = True, depth: float = DEPTH
 ) -> mujoco.MjsGeom:
-    """Add the whole map to the world body as one height field, `terrain_0`. Its vertical faces become slopes one cell wide or
-    more.
+    """Add the whole map to the world body as one height field, `terrain_0`. Vertical faces become slopes at least one cell
+    wide.
 
     Where corners of neighbouring cells differ in height, the height field's point lies at their mean.
     """
@@ -90,7 +91,7 @@ def add_height_field(
 
 
 def lattice_heights(ground: HeightMap) -> np.ndarray:
-    """Return (X + 1, Y + 1) heights at the corners of all cells [m]: their mean where neighbouring cells differ."""
+    """Return the heights (X + 1, Y + 1) of the cells' corners [m]. Where cells differ at a common corner, take their mean."""
     return _lattice(ground.corners)[0]
 
 
@@ -123,7 +124,7 @@ class _Geoms:
         name = self._name()
         self.spec.add_hfield(
             name=name,
-            nrow=heights.shape[1],  # rows lie along y
+            nrow=heights.shape[1],  # the row index counts along y
             ncol=heights.shape[0],
             size=[*half, max(high - low, SAME), max(low - self.floor, 0.1)],
             userdata=(heights.T.ravel() - low) / max(high - low, SAME),
@@ -149,7 +150,7 @@ def _attributes(material: str | None, collide: bool) -> dict[str, Any]:
 
 
 def _edges(count: int, side: int, border: int) -> list[int]:
-    """Return the first cells of `count` tiles, and the end of the last. The outer tiles reach one cell into the border."""
+    """Return each tile's first cell, and the end of the last tile. The outer tiles reach one cell into the border."""
     edges = [border + i * side for i in range(count + 1)]
     edges[0] -= min(border, 1)
     edges[-1] += min(border, 1)
@@ -181,9 +182,10 @@ def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
     """Yield sets of cells (X, Y) that together are the `sloped` cells. Each set fits one height field: the cells of a set
     agree in the points that they share, and the field does not stick out above any other cell.
 
-    The first set leaves out all cells around two kinds of points. At the first kind, slopes disagree. The second kind lies
-    above a lower cell of which the field would contain three corners or more, for example because slopes surround it. The
-    cells that are left out are distributed over further sets, in which any two cells are separated by two others.
+    The first set leaves out all cells around two kinds of points. At the first kind, sloped cells differ in height. The
+    second kind lies above a corner of another cell, of which the field would contain at least three corners, for example
+    because slopes surround the cell. The cells that are left out are distributed over further sets. Between two cells of such
+    a set lie at least two other cells.
     """
     points, bad = _lattice(corners, sloped)
     used = [~np.isnan(own) for own in _at_corners(points)]
@@ -198,16 +200,14 @@ def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _at_corners(points: np.ndarray) -> list[np.ndarray]:
-    """Return four views (X, Y) of lattice points (X + 1, Y + 1): the points at each corner of the cells, in the order of
-    CORNERS.
-    """
+    """Return four views (X, Y) of lattice points (X + 1, Y + 1): one for each corner of the cells, as ordered in CORNERS."""
     x, y = (n - 1 for n in points.shape)
     return [points[right : right + x, up : up + y] for right, up in CORNERS]
 
 
 def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean (X + 1, Y + 1) of the corners (X, Y, 4) of cells at each lattice point [m], and a mask of the points at
-    which the corners differ.
+    """Return the mean height [m] of the cells' corners at each lattice point, (X + 1, Y + 1), and a mask of the points at
+    which they differ. `corners` is (X, Y, 4).
 
     With `used` (X, Y), only used cells count. The mean is NaN at points without used cells.
     """
@@ -227,14 +227,14 @@ def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.nd
 
 
 def _steepness(corners: np.ndarray, cell: float) -> np.ndarray:
-    """Return for the corners (X, Y, 4) of cells the ratio (X, Y) of surface area to horizontal area: 1 for level cells."""
+    """Return the ratio of each cell's surface area to its horizontal area, (X, Y): 1 if level. `corners` is (X, Y, 4)."""
     signs = 2.0 * np.array(CORNERS) - 1.0
     slopes = corners.astype(np.float64) @ signs / (2.0 * cell)
     return np.sqrt(1.0 + (slopes**2).sum(axis=2))
 
 
 def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tuple[slice, slice, float]]:
-    """Yield rectangles and their heights [m] that together cover all flat cells of heights `low` (X, Y) [m].
+    """Yield rectangles of cells, and their heights [m]. They cover all `flat` cells (X, Y), whose heights are `low` [m].
 
     Boxes are solid, so a box may extend below higher cells: a pyramid becomes a stack of plates. Boxes that are only rendered
     do not overlap. Boxes that collide overlap those of equal height (`overlap`), because at a seam between boxes, a foot that

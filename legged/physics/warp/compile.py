@@ -32,8 +32,7 @@ STALLED_S = 300.0
 """Time without a finished module after which compiling processes are ended [s]."""
 MOST_PROCESSES = 16
 TILED_COSTS = 20
-"""Number of ordinary kernels that take as long to compile as a tiled kernel, which may need CUDA's linear algebra
-libraries."""
+"""Compiling a tiled kernel takes as long as this many ordinary kernels: it may need CUDA's linear algebra."""
 CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
 """Threads per block that Warp uses by default. Each block size is compiled separately."""
 
@@ -62,7 +61,7 @@ class Build:
 
 
 def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int:
-    """Compile the modules that `functions` launch on a Warp device and that the cache lacks. Return their number.
+    """Compile those modules that `functions` launch on a Warp device and that are not in the cache. Return their number.
 
     The functions are called without launching kernels, so the arrays that they read hold meaningless numbers.
     """
@@ -123,9 +122,7 @@ def _instead(**functions: Callable[..., None]) -> Iterator[None]:
 
 
 def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) -> None:
-    """Compile in forked processes, which take their work from a pipe, and show the number of finished modules. Return when
-    all processes have ended.
-    """
+    """Compile in forked processes, which take modules from a pipe. Show progress. Return when all processes have ended."""
     work, give = os.pipe()
     os.write(give, b"".join(struct.pack("=H", i) for i in range(len(builds))))
     os.close(give)
@@ -151,9 +148,7 @@ def _compile_all(builds: list[Build], device: Any, show: Callable[[int], None]) 
 
 
 def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
-    """Fork a process that compiles the modules whose indices it reads from `work`, with temporary files in `scratch`. Return
-    its id.
-    """
+    """Fork a process that compiles the modules whose indices it reads from `work`, and return its id."""
     parent = os.getpid()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Python warns about threads; the child uses neither threads nor their locks
@@ -172,7 +167,7 @@ def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
 
 
 class _Lock:
-    """File lock of the process that compiles into a cache."""
+    """File lock. Only the process that holds it compiles into the cache."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -183,7 +178,7 @@ class _Lock:
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            unlock_descriptor(self._file.fileno())  # closing does not release it while a child has the file open
+            unlock_descriptor(self._file.fileno())  # a close would keep the lock while a child has the file open
         self._file.close()
 
     def acquire(self) -> bool:
@@ -210,7 +205,7 @@ class Line:
             print(flush=True)
 
     def show(self, before: int, more: int = 0) -> None:
-        """Show that `before` plus `more` modules are compiled."""
+        """Show the progress after `before + more` compiled modules."""
         now = time.monotonic()
         if self._terminal or now - self._shown >= PLAIN_LINES_EVERY_S:
             self._shown = now

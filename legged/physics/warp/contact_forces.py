@@ -99,7 +99,7 @@ def sum_contact_forces(
                         if k < 2:
                             force[k + 1] = (up - down) * friction[c][k]
                 on_second = force @ frame[c]
-            count = lanes_with(row >= 0)  # contacts with rows come first
+            count = lanes_with(row >= 0)  # contacts with constraint rows come first
             for k in range(count):
                 first, second = whole_from_lane(shapes_of[0], k), whole_from_lane(shapes_of[1], k)
                 push = wp.vec3(from_lane(on_second[0], k), from_lane(on_second[1], k), from_lane(on_second[2], k))

@@ -25,8 +25,8 @@ class Launcher:
     ) -> None:
         """Launch a kernel. The first `vectors` of its arguments are arrays of vectors (..., 3).
 
-        On a CPU the launch is recorded, because preparing it takes longer than running it. The next step replays it if its
-        tensors are the same.
+        On a CPU the launch is recorded, because preparing it takes longer than running it. The next call with the same
+        kernel, dimension and tensors replays it.
         """
         with self._on_device():
             key = None
@@ -38,7 +38,7 @@ class Launcher:
             inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
             wp.launch(kernel, dim=dim, inputs=inputs)
             if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                # If the table is full, its launches belong to tensors that each step creates anew, so they are useless.
+                # The table is only full if each step creates new tensors. Its launches are then useless, and are dropped.
                 if len(self._prepared) >= MOST_PREPARED:
                     self._prepared.clear()
                 self._prepared[key] = prepared

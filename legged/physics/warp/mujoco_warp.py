@@ -75,7 +75,7 @@ class NoBlocks(Exception):
 
 
 class MujocoWarpPhysics(WarpPhysics):
-    """N worlds in mujoco-warp, whose own arrays are the state."""
+    """N worlds in mujoco-warp. The tensors of the state are views of mujoco-warp's own arrays."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class MujocoWarpPhysics(WarpPhysics):
         """Names of the model arrays with one row per world."""
         with wp.ScopedDevice(self._wp_device):
             self._m = self._put_model(scene.name)
-            self._m.opt.warn_overflow = 0  # `refresh` counts overflows; a warning would be printed by each thread
+            self._m.opt.warn_overflow = 0  # `refresh` reports overflows; a warning would come from each thread
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             self._on_cells: TerrainContact | None = None
             if terrain is not None and cells:
@@ -237,7 +237,7 @@ class MujocoWarpPhysics(WarpPhysics):
             raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
         if no_solver:
             return
-        self._m.opt.run_qacc_smooth = False  # the fused solver does not start from this acceleration
+        self._m.opt.run_qacc_smooth = False  # the fused solver does not use `qacc_smooth`
         if self.why_library:
             self._solver = ConstraintSolver(self.model, self._m, self._d)
         else:
@@ -263,7 +263,7 @@ class MujocoWarpPhysics(WarpPhysics):
         """Make a physics step of mujoco-warp's library."""
         with self._on_device():
             asked = self._m.opt.run_qacc_smooth
-            self._m.opt.run_qacc_smooth = True  # mujoco-warp's solver starts from this acceleration
+            self._m.opt.run_qacc_smooth = True  # mujoco-warp's solver uses `qacc_smooth`
             mjw.step(self._m, self._d)
             self._m.opt.run_qacc_smooth = asked
 

@@ -1,4 +1,4 @@
-"""Learned actuators in one launch per physics step. legged/mdp/actuator_network.py describes them and has them in torch.
+"""Learned actuators in one launch per physics step. legged/mdp/actuator_network.py has the description and the torch code.
 
 Each thread computes one joint of one robot. The network's units lie in a column of `scratch`, so that neighbouring threads
 read adjacent numbers.
@@ -72,9 +72,9 @@ def run_lstm(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """Run the LSTM. One thread per robot and joint. Each cell has the weights of inputs (4 out, in), then those of hidden
-    units (4 out, out), then the biases, for the gates i, f, g, o. Hidden states are the even rows of `state`, cell states the
-    odd rows.
+    """Run the LSTM. One thread per robot and joint. `weights` holds, for each layer, the weights of inputs (4 out, in), those
+    of hidden units (4 out, out) and biases, for the gates i, f, g, o. Hidden states are the even rows of `state`, cell states
+    the odd.
     """
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint

@@ -77,7 +77,7 @@ class WarpPhysics(Physics):
 
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
-        if not forces_read:  # read forces once per step, because a later reset clears those of its worlds
+        if not forces_read:  # on a second call, this would undo the clearing of forces by `write`
             with self._forces_stream.fork(), self._on_device():
                 self._state_io.contact_forces()
         with self._on_device():

@@ -22,8 +22,8 @@ def find_moments(
     chosen: wp.array[wp.int64],
     chosen_due: wp.array[wp.bool],
 ):
-    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` means never, column 1 a reset, and
-    the others the ends of intervals. When column `chosen_at` is due, another model variant is chosen.
+    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` is never true, column 1 is true at
+    a reset, and the others at the ends of intervals. A robot gets another model variant if column `chosen_at` is true.
     """
     robot = wp.tid()
     something = wp.bool(reset[robot])
@@ -48,7 +48,7 @@ def find_moments(
 
 @wp.func
 def drawn_value(even: float, column: int, table: wp.array2d[float], steps: float) -> float:
-    """Return the random value of a column of `Distributions.table` for a uniform number."""
+    """Convert a uniform number to a value from the distribution in row `column` of `Distributions.table`."""
     value = even
     kind = table[column, 0]
     if kind > 0.0:
@@ -86,8 +86,8 @@ def make_fresh(
     chosen: wp.array[wp.int64],
     fresh: wp.array2d[float],
 ):
-    """Compute new random values, and choose model variants. One thread per robot and column. Columns with a `place` beyond
-    the table take their values from the chosen variant.
+    """Compute new random values, and choose model variants. One thread per robot and column. A column whose `place` is beyond
+    the end of `table` takes its value from the chosen variant.
     """
     robot, column = wp.tid()
     variant = wp.clamp(int(choice[robot, 0]), 0, variants.shape[0] - 1)

@@ -1,6 +1,4 @@
-"""Kernels that copy random values into a model's arrays within a step: one launch for all arrays, without reading on the
-host.
-"""
+"""Kernels that write random values to a model's arrays within a step, in one launch for all arrays."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,8 +15,8 @@ HOW = {"set": 0, "add": 1, "scale": 2}
 BOUNCE = {"": 0, "ratio": 1, "inverse": 2}
 ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.constant(BOUNCE["inverse"])
 THREADS = 128
-"""Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. With one thread per
-number and world, most threads would be idle. A single warp per world would wait about ten times for the data of a number."""
+"""Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. With one thread for each
+number and world, most threads would be idle. A single warp would take about ten rounds, and wait for memory in each."""
 MOST_ARRAYS = 14
 """Largest number of arrays that one launch writes. All fields together need fewer."""
 
@@ -91,10 +89,9 @@ def write_drawn(
     ratios: wp.array[float],
     to: Arrays,
 ):
-    """Compute the randomised numbers of the worlds in `mask`: each starts from the model's own number, which the fields
-    change one after the other. `threads` threads per world share the numbers. `place` holds the array of each number and its
-    position there. `entry` holds, for each change, the column of the value, the operation, and the conversion from
-    restitution.
+    """Compute the randomised numbers of the worlds in `mask`: the fields change the model's own number one after the other.
+    `threads` threads per world share the numbers. `place` holds the array of each number and its position there. `entry`
+    holds, for each change, the column of the value, the operation, and the conversion from restitution.
     """
     world, thread = wp.tid()
     if not mask[world]:
@@ -208,8 +205,8 @@ class Variants:
     """Model variants with derived constants. Each world takes one of them."""
 
     def __init__(self, arrays: Mapping[str, tuple[Tensor, Tensor]]) -> None:
-        """Keep, for each array, the variants (K, ...) and the worlds' array (N, ...). Warp's current device must be that of
-        the tensors.
+        """`arrays` has the variants (K, ...) and the worlds' array (N, ...) of each name. Warp's current device must be
+        theirs.
         """
         self._variants = self._side_by_side({name: made for name, (made, _) in arrays.items()})
         widths = [made[0].numel() for made, _ in arrays.values()]
@@ -228,6 +225,6 @@ class Variants:
         self._variants.copy_(self._side_by_side(made))
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy the variants `chosen` (N,) into the worlds of `mask` (N,)."""
+        """Copy into each world of `mask` (N,) the variant with its index in `chosen` (N,)."""
         inputs = [self._dim[1], wp.from_torch(mask), wp.from_torch(chosen), *self._inputs]
         wp.launch(copy_variants, dim=self._dim, inputs=inputs)

@@ -1,5 +1,4 @@
-"""Kernels between an engine's arrays and those of the task: one launch writes states, one reads kinematics, one to three read
-contact forces.
+"""Kernels that copy states, kinematics and contact forces between an engine's arrays and those of the task.
 
 The same formulas in torch (mujoco.py, feet.py) take about 140 launches per control step, a third of its time with 4096
 robots.
@@ -66,8 +65,8 @@ def read_kinematics(
     feet_vel: wp.array2d[wp.vec3],
     overflowed: wp.array[wp.bool],
 ):
-    """Compute the base's velocity and gravity in its frame, the feet and the overflow flags. One thread per world and foot.
-    Tables are (levels, feet), from the foot's body up to the base's child.
+    """Compute the base's velocity and gravity in the base frame, the feet's positions and velocities, and the overflow flags.
+    One thread per world and foot. Tables are (levels, feet), from the foot up to the base.
     """
     world, foot = wp.tid()
     base = wp.vec3(qpos[world, 0], qpos[world, 1], qpos[world, 2])
@@ -155,7 +154,7 @@ class EngineArrays:
     warmstart: wp.array
     """Warm start of the solver; (N, 0) if the engine clears it itself."""
     overflow: wp.array
-    """(N,) overflow flags, which reading clears."""
+    """(N,) overflow flags. `StateIO.kinematics` clears them."""
     lost: int
     """Bits of `overflow` that mean that contacts or constraint rows were dropped."""
 
@@ -164,9 +163,7 @@ class StateIO:
     """Launches of the kernels that write states and read kinematics, on fixed arrays, so that a graph can capture them."""
 
     def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
-        """Prepare for a model without a robot, from which only `overflowed` (N,) is read. Warp's current device must be that
-        of the arrays.
-        """
+        """Prepare for a model without a robot: only `overflowed` (N,) is read. Warp's current device must be the arrays'."""
         self._arrays = arrays
         self._overflowed = wp.from_torch(overflowed)
         self._contact_forces = wp.zeros((len(overflowed), 0), dtype=wp.vec3)
@@ -280,5 +277,5 @@ class MujocoWarpStateIO(RobotStateIO):
 
 
 def arrays_of(d: Any) -> EngineArrays:
-    """Return the arrays of mujoco-warp's data that are written and read."""
+    """Return the arrays of mujoco-warp's data that the kernels write or read."""
     return EngineArrays(d.qpos, d.qvel, d.ctrl, d.act, d.qacc_warmstart, d.overflow, LOST)

@@ -145,7 +145,7 @@ def follow_commands(
     share: wp.array[float],
     reached: wp.array3d[float],
 ):
-    """Compute the size of each command that counts, and the velocity in its direction. One thread per robot and axis."""
+    """For each command that counts, compute its size and the velocity in its direction. One thread per robot and axis."""
     robot, axis = wp.tid()
     command = commands[robot, axis]
     size = wp.abs(command)
@@ -202,9 +202,7 @@ def scan_heights(
     heights: wp.array2d[float],
     ground: wp.array[float],
 ):
-    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base's
-    position.
-    """
+    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base."""
     robot, point = wp.tid()
     w, x, y, z = base_quat[robot, 0], base_quat[robot, 1], base_quat[robot, 2], base_quat[robot, 3]
     yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -274,8 +272,9 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """Add up rewards. One thread per robot; rows are terms. Terms are processed in groups of four, so that all reads of a
-    group precede its writes and wait for memory together: the compiler moves no read ahead of a write.
+    """Add up the rewards of all terms, which are the rows of arrays. One thread per robot. Terms are processed in groups of
+    four, so that all reads of a group precede its writes and wait for memory together: the compiler moves no read ahead of a
+    write.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -308,9 +307,7 @@ class TaskKernels(Launcher):
     """Launches of task kernels on an engine's device, on torch's current stream. All array arguments are torch tensors."""
 
     def name_module(self) -> None:
-        """Launch one kernel of this module. A dry run, which finds the modules to compile, calls this method. All kernels
-        here are in one module.
-        """
+        """Launch one kernel of this file's module, so that the dry run before compilation finds the module."""
         wp.launch(hold_joints, dim=1)
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
@@ -322,11 +319,11 @@ class TaskKernels(Launcher):
         self.launch(drive_joints, dim, arguments)
 
     def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` of an MLP. The last argument receives the result."""
+        """Launch the kernel of `ActuatorNetwork.torques` for an MLP. The last argument receives the result."""
         self.launch(run_mlp, tuple(error.shape), (error, *arguments))
 
     def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` of an LSTM. The last argument receives the result."""
+        """Launch the kernel of `ActuatorNetwork.torques` for an LSTM. The last argument receives the result."""
         self.launch(run_lstm, tuple(error.shape), (error, *arguments))
 
     def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
@@ -338,7 +335,7 @@ class TaskKernels(Launcher):
         self.launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def find_pushes(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of the first half of `Pushes.push`."""
+        """Launch the kernel of `Pushes.push` that finds the robots to push and their changes of velocity."""
         self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def make_draws(self, *arguments: Tensor) -> None:
@@ -350,11 +347,11 @@ class TaskKernels(Launcher):
         self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
 
     def find_moments(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of the first half of `Randomization.redraw`."""
+        """Launch the kernel of `Randomization.redraw` that finds the values to resample."""
         self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def take_fresh(self, *arguments: Tensor) -> None:
-        """Launch the kernel of the second half of `Randomization.redraw`. The last argument receives the result."""
+        """Launch the kernel of `Randomization.redraw` that copies new values. The last argument receives them."""
         self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
 
     def vary_control(self, *arguments: Tensor) -> None:
@@ -362,7 +359,7 @@ class TaskKernels(Launcher):
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Disturbances.act` without the kicks. The last argument (N, bodies, 6) gets the forces."""
+        """Launch the kernel of `Disturbances.act`. It finds kicks, and writes forces to the last argument (N, bodies, 6)."""
         total: Tensor = arguments[-1]  # type: ignore[assignment]
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
@@ -371,11 +368,11 @@ class TaskKernels(Launcher):
         self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
     def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
-        """Launch the kernel of the first half of `CommandCurriculum.update`."""
+        """Launch the kernel of `CommandCurriculum.update` that measures how far robots follow their commands."""
         self.launch(follow_commands, tuple(commands.shape), (commands, *arguments))
 
     def widen_commands(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of the second half of `CommandCurriculum.update`."""
+        """Launch the kernel of `CommandCurriculum.update` that widens the ranges of commands."""
         self.launch(widen_commands, 1, arguments)
 
     def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
@@ -384,9 +381,9 @@ class TaskKernels(Launcher):
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
 
     def move_levels(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `TerrainCurriculum.update`, except the sums over robots."""
+        """Launch the kernel of `TerrainCurriculum.update`. The caller computes the sums over robots."""
         self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Rewards.compute` for known values of the terms."""
+        """Launch the kernel of `Rewards.compute`. `values` (terms, N) are the values of all terms."""
         self.launch(add_rewards, values.shape[1], (values, *arguments))
