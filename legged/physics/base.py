@@ -50,8 +50,8 @@ class Physics(ABC):
     why_c_engine: str = ""
     """Reason why `auto` chose the C engine although there are at least `MANY_WORLDS` worlds. Empty in all other cases."""
     fitted: str = ""
-    """Description of the simple shapes that replace meshes, which the terrain collider does not support. Empty without
-    these."""
+    """Description of the simple shapes that replace meshes, which the terrain collider does not support. Empty if no mesh was
+    replaced."""
     compiled: int = 0
     """Number of kernel modules that were not in the cache and were compiled for this physics."""
     overflowed: Tensor
@@ -73,7 +73,8 @@ class Physics(ABC):
 
     @abstractmethod
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
-        """Set the state of the worlds in `mask` (N,) to `qpos` (N, nq) and `qvel` (N, nv), laid out as the attributes.
+        """Set the state of the worlds in `mask` (N,) to `qpos` (N, nq) and `qvel` (N, nv), with the layout and frames of the
+        attributes `qpos` and `qvel`.
 
         This clears the controls, activations, contact forces and warm starts of these worlds. Other worlds do not change.
         """
@@ -102,8 +103,8 @@ class Physics(ABC):
 
     @abstractmethod
     def redraw(self, mask: Tensor) -> None:
-        """Apply the current values of `drawn` (see `prepare_redraws`) to the model arrays of the worlds in `mask` (N,). A
-        step of a `capturable` engine may contain this.
+        """Apply the current values of `drawn` (see `prepare_redraws`) to the model arrays of the worlds in `mask` (N,). If
+        the engine is `capturable`, a CUDA graph may capture this.
         """
 
     @abstractmethod
@@ -115,7 +116,7 @@ class Physics(ABC):
     @abstractmethod
     def choose_variants(self, mask: Tensor, chosen: Tensor) -> None:
         """Give each world in `mask` (N,) the masses, inertias and derived constants of a variant; `chosen` (N,) int64 holds
-        the variant's index for each world. A step of a `capturable` engine may contain this.
+        the variant's index for each world. If the engine is `capturable`, a CUDA graph may capture this.
         """
 
     def quantity(self, name: str) -> Tensor:
@@ -141,7 +142,7 @@ class Physics(ABC):
         """
         take(self.state_tensors(), saved, type(self).__name__)
         self.refresh()
-        if self.robot_state is not None:  # `refresh` may have read the forces of the engine's last step
+        if self.robot_state is not None:  # `refresh` may have overwritten them with the engine's own last forces
             self.robot_state.contact_forces.copy_(saved["contact_forces"])
 
     @abstractmethod

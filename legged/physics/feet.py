@@ -16,8 +16,8 @@ from legged.robots.robot import Robot
 @dataclass(frozen=True)
 class FootChains:
     """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), ordered from the foot to the
-    base; lengths are in metres. A hinge rotates points about its axis in the hinge's frame; `body_pos` and `body_quat` place
-    this frame.
+    base; lengths are in metres. Each hinge has its own frame, in which `axis` and `anchor` are given. `body_pos` and
+    `body_quat` are the pose of this frame at angle 0 in the frame of the next hinge.
     """
 
     offset: np.ndarray
@@ -28,13 +28,12 @@ class FootChains:
     axis: np.ndarray
     anchor: np.ndarray
     body_pos: np.ndarray
-    """(levels, F, 3) position and `body_quat` orientation, in the frame of the next hinge, of the hinge's frame at angle
-    0."""
+    """(levels, F, 3) position of the hinge's frame; `body_quat` is the orientation of this frame."""
     body_quat: np.ndarray
 
     @classmethod
     def of(cls, model: mujoco.MjModel, robot: Robot) -> "FootChains":
-        """Return the chains of a robot.
+        """Return the chains of hinges of a robot.
 
         Raises:
             ConfigError: the feet have different numbers of hinges, or a joint between base and foot is not a hinge.
@@ -73,8 +72,8 @@ class _Hinge:
 
 
 def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
-    """Return the hinges from `body` up to `base`. Also convert the point `offset` from the frame of `body` to the frame of
-    the first hinge. A body may have no hinge (if it is welded to its parent) or several. Error messages begin with `where`.
+    """Return the hinges from `body` up to `base`, and the point `offset`, converted from the frame of `body` to that of the
+    first hinge. A body may have no hinge (if it is welded to its parent) or several. Error messages begin with `where`.
 
     Raises:
         ConfigError: a joint is not a hinge.
@@ -97,7 +96,7 @@ def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, whe
 
 
 def _turn_back(model: mujoco.MjModel, hinge: _Hinge) -> None:
-    """Rotate a hinge's frame about its anchor from the reference angle to angle 0."""
+    """Rotate a hinge's frame about the hinge's anchor, from the reference angle to angle 0."""
     anchor, turned = model.jnt_pos[hinge.joint], np.zeros(3)
     reference = float(model.qpos0[model.jnt_qposadr[hinge.joint]])
     mujoco.mju_axisAngle2Quat(hinge.quat, model.jnt_axis[hinge.joint], -reference)

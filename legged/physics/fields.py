@@ -53,7 +53,7 @@ def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
 
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
     """Return `-per_gear` for actuators with an affine bias, 0 for others, (nu,). A position servo keeps its target if
-    `per_gear` is added to its gain, and this to its bias on position.
+    `per_gear` is added to its gain and this number to its position bias.
     """
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
 
@@ -71,8 +71,8 @@ class Change:
     least: float | None = 0.0
     """Smallest allowed number in the array; None for no limit."""
     bounce: Literal["", "ratio", "inverse"] = ""
-    """"ratio" if the values are restitutions and the array takes their damping ratios; "inverse" if it takes the inverse of
-    these. Empty if the values are not restitutions."""
+    """"ratio" if values are restitutions and the array takes their damping ratios, "inverse" if it takes 1 / damping ratio.
+    Empty if values are not restitutions."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Field:
     highest: float | None = None
     """Highest meaningful value; None without a limit."""
     law: bool = False
-    """True if the control law of legged robots uses the field. It has one row for each joint."""
+    """True if the control law of legged robots uses the field. The field then has one row for each joint."""
     each: bool = False
     """True if each row of a world has its own random value by default, instead of one value for all rows."""
 
@@ -245,12 +245,12 @@ MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
 """Fields that change the model, which `Physics.randomize` accepts. The others affect only the control law."""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""Fields that every solver of Newton supports, because Newton's own model has arrays for them. Its MuJoCo solver supports
-all."""
+"""Fields that every solver of Newton supports, because Newton's own model has arrays for them. Newton's MuJoCo solver
+supports all fields."""
 
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
-    """Return the number of rows of each field: of array rows that it changes, or of joints that have it."""
+    """Return, for each field, the number of array rows that it changes, or of joints if it changes no array."""
     return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
 
 

@@ -78,8 +78,8 @@ class RandomizedModel:
 
     def variants(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the arrays of K model variants, (K, ...): those that derived fields change, and those that C MuJoCo derives
-        from them (`DERIVED`). `values` holds (K, 1) or (K, rows) numbers for each field. The variants are computed before
-        training, because no constants can be derived within a captured step.
+        from them (`DERIVED`). `values` holds (K, 1) or (K, rows) numbers for each field. They are computed outside steps,
+        because a captured step cannot derive constants.
         """
         on_host = RandomizedModel(self._scene, self.model, values, torch.float64, torch.device("cpu"))
         changed = on_host.arrays(changed_arrays(values), values)

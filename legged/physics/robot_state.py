@@ -11,7 +11,7 @@ from legged.robots.robot import Robot
 @dataclass(frozen=True)
 class RobotState:
     """State of N robots, as the task reads it: float32 tensors, allocated once, which the physics engine writes in place.
-    Fields that are views of `Physics.qpos` or `Physics.qvel` are current after a step; the others are current after a
+    Fields that are views of `Physics.qpos` or `Physics.qvel` are up to date after a step; all others are up to date after a
     refresh.
 
     D joints and F feet are in the robot's order; B is the number of contacts (`Robot.contact_names`).

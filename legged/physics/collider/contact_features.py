@@ -85,7 +85,7 @@ def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[C
 
 @wp.func
 def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
-    """Write a thin disc's possible contacts with vertical faces and their rims to row `row` of `hits`. Return their number."""
+    """Write a thin disc's possible contacts with vertical faces and rims to row `row` of `hits`. Return their number."""
     found = around_point(ground, centre, radius + margin, True, hits, row)
     count = wp.int32(0)
     for k in range(found):

@@ -9,7 +9,7 @@ import numpy as np
 
 KINDS = mujoco.mjtGeom
 ROUND = (int(KINDS.mjGEOM_SPHERE), int(KINDS.mjGEOM_CAPSULE))
-"""Types of shapes that are a point or a segment with a radius, so that distances between them are simple to compute."""
+"""Types of shapes that are a point or a segment with a radius. Any two of them may collide."""
 ON_PLANES = (*ROUND, int(KINDS.mjGEOM_ELLIPSOID), int(KINDS.mjGEOM_CYLINDER), int(KINDS.mjGEOM_BOX))
 """Types of shapes that touch a plane in a few points."""
 POINT, END, CORNER, RIM, ELLIPSOID = range(5)
@@ -36,7 +36,7 @@ class ContactPair:
     dim: int
     """Number of directions in which the contact exerts force: 1, 3, 4 or 6."""
     rough: tuple[int, int]
-    """Ids of two geoms, of whose friction the contact uses the larger; (-1, -1) if it uses `friction` instead."""
+    """Ids of two geoms. The contact uses the larger friction of both, or `friction` if the ids are (-1, -1)."""
     friction: np.ndarray
     """(5,) coefficients: sliding along two tangents, torsion about the normal, rolling about two tangents."""
     solref: np.ndarray
@@ -67,7 +67,7 @@ def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1)
         share = float(mixes[0] / mixes.sum()) if mixes.min() >= TINY else float(mixes[0] >= TINY)
     weights = np.array([share, 1.0 - share])
     solref = model.geom_solref[both]
-    # Only one shape's solref counts, or both have time constants.
+    # The two solrefs are averaged if one shape has priority (weight 1), or if both are time constants.
     alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()
     mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())

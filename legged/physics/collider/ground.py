@@ -35,7 +35,7 @@ class Ground:
     cell: float
     """Edge length of a cell [m]."""
     reach: int
-    """Number of cells on each side of the cell below a feature's centre that the largest feature can touch."""
+    """The largest feature can touch this many cells on each side of the cell below its centre."""
 
 
 @wp.struct
@@ -93,8 +93,8 @@ def on_plane(p: wp.vec3, foot: wp.vec3, s: wp.vec3) -> Hit:
 
 @wp.func
 def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
-    """Return the possible contact of a point `p` below the surface of cell (i, j). It pushes the point out by the shortest
-    way: up (`top` is this contact), or sideways through a vertical face of the cell.
+    """Return the possible contact of a point `p` below the surface of cell (i, j). The contact pushes the point out by the
+    shortest way: up, as the contact `top` does, or sideways through a vertical face of the cell.
     """
     best = top
     x0 = ground.x + float(i) * ground.cell
@@ -145,8 +145,8 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
             if hit.dist < 1e-6:  # the point lies on the face; push it to the side of the point's cell
                 hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
     elif s[0] > before - FACE:
-        # The two surfaces meet without a face. The neighbour's counts only if the point's projection on it lies in the
-        # neighbour.
+        # No face separates the two surfaces. The neighbour's surface counts only if the point's projection on its plane lies
+        # in the neighbour.
         plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
         x = p[0] - plane.dist * plane.normal[0]
         y = p[1] - plane.dist * plane.normal[1]
@@ -311,7 +311,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
 
 
 def room_for_hits(rows: int) -> Hits:
-    """Return memory with `rows` rows on Warp's current device."""
+    """Return memory for the contacts of `rows` features, on Warp's current device."""
     hits = Hits()
     hits.dist = wp.zeros((rows, int(MOST)), dtype=float)
     hits.normal = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
@@ -320,8 +320,8 @@ def room_for_hits(rows: int) -> Hits:
 
 
 def ground_of(height_map: HeightMap, largest: float, longest: float) -> Ground:
-    """Return `height_map` on Warp's current device. Features have radii up to `largest`, capsules lengths up to `longest`
-    [m].
+    """Return `height_map` on Warp's current device. Features may have radii up to `largest` [m], and capsules lengths up to
+    `longest` [m].
     """
     reach = int(np.ceil(largest / height_map.cell - 1e-9))
     wide = int(np.ceil((0.5 * longest + largest) / height_map.cell))

@@ -22,7 +22,9 @@ from legged.physics.fused.wide_solver import WIDE, wide_function
 
 
 def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
-    """Return the kernel for a `step` and its `contacts`, of dimension (blocks,). It steps the worlds `first` to `end - 1`."""
+    """Return the kernel for a `step` and its `contacts`. Its launch dimension is (blocks,). A launch steps the worlds from
+    `first` to `end - 1`.
+    """
     assert step.solver.wide is not None
     move_world = dynamics_function(step.dynamics.constants)
     contacts_of_world = stage_function(contacts.constants, *contacts.kinds)

@@ -30,13 +30,14 @@ auto dof_at = [&](int slot) {
 const int DOFS = NV, KEPT = 0;
 #endif
 LEGGED_SHARED float J[KEPT > 0 ? KEPT * STRIDE : 1], M[NV * STRIDE];
-LEGGED_SHARED float shown[STRIDE];  // a vector over degrees of freedom that all lanes can read
+LEGGED_SHARED float shown[STRIDE];  // one number for each degree of freedom, which all lanes can read
 LEGGED_SHARED float D[ROWS], x[ROWS], force[ROWS], curvature[ROWS];
 float* jv = force;  // J times the step, until new forces are computed
 LEGGED_SHARED signed char states[ROWS];
 LEGGED_SHARED short pushing[ROWS];  // rows that exert force or have curvature
 LEGGED_SHARED bool couples[ROWS];  // true for a row that moves degrees of freedom of several branches
-const int DRY_DOFS = DRY ? NV : 1;  // dry friction rows by degree of freedom; `dry_row` is the row, or -1
+// The arrays below have one entry for each degree of freedom's row of dry friction; `dry_row` is the row's index, or -1.
+const int DRY_DOFS = DRY ? NV : 1;
 LEGGED_SHARED float dry_D[DRY_DOFS], dry_loss[DRY_DOFS], dry_reference[DRY_DOFS], dry_curvature[DRY_DOFS];
 LEGGED_SHARED signed char dry_states[DRY_DOFS];
 LEGGED_SHARED short dry_row[DRY_DOFS];

@@ -1,4 +1,5 @@
-"""MuJoCo's Newton solver for constraint forces in one launch. A warp of threads keeps a world's data on the chip.
+"""MuJoCo's Newton solver for constraint forces in one launch. One warp of threads computes each world, whose data stay on the
+chip.
 
 mujoco-warp needs about ten launches per iteration of the solver, and iterates until the slowest world has converged. Here
 each world stops when it has converged. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"):
@@ -105,7 +106,9 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
 
 
 def ask_for_dense_rows(model: mujoco.MjModel) -> None:
-    """Make mujoco-warp store dense Jacobians, which this solver reads. Its default above 32 degrees of freedom is sparse."""
+    """Make mujoco-warp store dense Jacobians, because this solver reads only these. By default, mujoco-warp stores sparse
+    Jacobians above 32 degrees of freedom.
+    """
     if model.nv <= MOST_DOFS:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
 
@@ -114,7 +117,8 @@ class ConstraintSolver:
     """Computes constraint forces and accelerations of all worlds from mujoco-warp's data."""
 
     advance: wp.array2d
-    """(worlds, nv) accelerations that change velocities: `qacc`, or another array if dampers are integrated implicitly."""
+    """(worlds, nv) accelerations from which the next velocities are computed: `qacc`, or another array if dampers are
+    integrated implicitly."""
 
     def __init__(
         self, model: mujoco.MjModel, m: Any, d: Any, damped: bool = False, active_set: ActiveSet | None = None

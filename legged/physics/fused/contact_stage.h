@@ -1,12 +1,12 @@
 // Constraint rows of one world: dry friction, joint limits, and the `found` contacts in the world's slots. They follow the
-// rows of equality constraints, which exist already. Constants: NV, NJ (degrees of freedom, joints), ROWS, SLOTS (largest
-// numbers of rows, of contacts), PLAIN (largest number of rows of friction and limits), DIMS (largest number of directions of
-// a contact), FRICTIONS, LIMITS, BALLS, EQUALITIES (the model has dry friction, joint limits, ball joints, equality
-// constraints), DENSE_FRICTION (the Jacobian's rows of dry friction are read), BOUNCES (the springs of contacts differ
-// between worlds), ELLIPTIC (friction cones instead of pyramids), and MuJoCo's numbers BALL, CONSTRAINT (a type of contact),
-// FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (an overflow flag). Each row has a key, with which the solver finds
-// the row's state in the last step. Keys ascend from row to row: first those of degrees of freedom, then of joints, then of
-// candidates for contacts.
+// rows of equality constraints, which exist already. Constants: NV (degrees of freedom), NJ (joints), ROWS (largest number of
+// rows), SLOTS (largest number of contacts), PLAIN (largest number of rows of friction and limits), DIMS (largest number of
+// directions of a contact), FRICTIONS (the model has dry friction), LIMITS (joint limits), BALLS (ball joints), EQUALITIES
+// (equality constraints), DENSE_FRICTION (the Jacobian's rows of dry friction are read), BOUNCES (the springs of contacts
+// differ between worlds), ELLIPTIC (friction cones instead of pyramids), and MuJoCo's numbers BALL, CONSTRAINT (a type of
+// contact), FRICTIONLESS, FRICTIONAL (types of rows), NARROWPHASE (an overflow flag). Each row has a key, with which the
+// solver finds the row's state in the last step. Keys ascend from row to row: first those of degrees of freedom, then of
+// joints, then of candidates for contacts.
 
 // Record of a contact: its offsets from the centres of mass of the two trees, its axes, its friction coefficients, and the
 // parameters of its rows.

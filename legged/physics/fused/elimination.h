@@ -16,7 +16,7 @@
 #define EACH_CORNER(n) EVERY_CORNER(n) if (n < CORNER)
 #define OF_CORNER(values, n) values[0]
 const int LIMBS = NV > 32 && NV - ROOT > 32 ? 2 : 1, CORNERS = 1;
-// Return the value that the lane of corner n has, or that the lane of limb i has.
+// `from_corner` returns the value of the lane that has corner n, `from_limb` that of the lane that has limb i.
 auto from_corner = [&](const float* values, int n) { return __shfl_sync(0xffffffffu, values[0], n); };
 auto from_limb = [&](const float* values, int i) {
     if (NV <= 32) return __shfl_sync(0xffffffffu, values[0], i);
@@ -128,7 +128,7 @@ auto solve = [&](auto tree) {
     UNROLLED_ALONG for (int t = height - 1; t >= ROOT; --t) {
         float* board = boards + (t & 1) * BOARD;
         EACH_LIMB(i) {
-            // Every lane reads it: otherwise the compiler reads H[depth], and H leaves the registers.
+            // Every lane reads the pivot. Otherwise the compiler indexes H by depth, and H cannot stay in registers.
             const float pivot = OF(H, i)[t];
             if ((branches ? OF(depth_of, i) : i) == t) {
                 float* row = board + (branches ? OF(place_of, i) * pitch : 0);

@@ -14,7 +14,8 @@ const int LANES = 32, lane = threadIdx.x & 31;
     for (int apart = 16; apart > 0; apart >>= 1) x += __shfl_xor_sync(0xffffffffu, x, apart);
     return x;
 };
-// Computes the sums of four numbers over all lanes. In each of two exchanges, a lane gives away half of its numbers.
+// Computes the sums of four numbers over all lanes. In each of the first two exchanges, a lane gives half of its numbers to
+// another lane.
 [[maybe_unused]] auto sum_four = [&](float* x) {
     const bool upper = lane & 16, odd = lane & 8;
     for (int k = 0; k < 2; ++k) {

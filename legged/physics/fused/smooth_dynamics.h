@@ -1,11 +1,11 @@
-// Poses, inertias and all forces except those of constraints, of one world with trees of free, ball, slide and hinge joints
-// in any order. Constants: NB, NV, NJ, NG, NT (bodies, degrees of freedom, joints, shapes, trees), DEPTH (levels of bodies
-// below the world), OF_INERTIA, OF_MOTION, OF_BODY (row strides in shared memory), BALLS, SLIDES, SPRINGS, BALL_SPRINGS,
-// DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (the model has the feature), ONE_MOTOR (at
-// most one motor per degree of freedom), PUSHED (external forces act on bodies), EQUALITIES (equality constraints hold
-// bodies), SITES (number of sites if equality constraints hold sites, else 0), FREE, BALL, SLIDE, AFFINE (MuJoCo's numbers of
-// types), and for each array of the model VARIES_<array> (worlds may differ in it). The compiler removes the code of features
-// that a model lacks.
+// Computes poses, inertias and all forces except constraint forces for one world, whose trees may have free, ball, slide and
+// hinge joints in any order. Constants: NB (bodies), NV (degrees of freedom), NJ (joints), NG (shapes), NT (trees), DEPTH
+// (levels of bodies below the world), OF_INERTIA, OF_MOTION, OF_BODY (row strides in shared memory), BALLS, SLIDES, SPRINGS,
+// BALL_SPRINGS, DAMPERS, GEARS, GAINS, AFFINE_BIAS, CONTROL_LIMITS, FORCE_LIMITS, JOINT_LIMITS (the model has the feature),
+// ONE_MOTOR (at most one motor per degree of freedom), PUSHED (external forces act on bodies), EQUALITIES (equality
+// constraints hold bodies), SITES (number of sites if equality constraints hold sites, else 0), FREE, BALL, SLIDE, AFFINE
+// (MuJoCo's numbers of types), and for each array of the model VARIES_<array> (worlds may differ in it). The compiler removes
+// the code of features that a model lacks.
 
 LEGGED_SHARED float centre[NB * 3], inertia[NB * OF_INERTIA], motion[NV * OF_MOTION], speed[NV];
 // Motions overwrite poses, which are then no longer needed. This saves shared memory, so that more worlds run at once.
@@ -53,7 +53,7 @@ auto dof_of = [](int packed) { return packed >> 16; };
 
 meet();  // wait until the previous world is finished
 // Load all data from global memory at once, and compute the rotations of all joints at once: in the loop over levels below,
-// all bodies wait for the slowest.
+// all bodies would wait for the slowest.
 EACH(b, NB) {
     for (int k = 0; k < 3; ++k) centre[b * 3 + k] = ROW(body_ipos, NB * 3)[b * 3 + k];
     for (int k = 0; k < 4; ++k) inertia[b * OF_INERTIA + TURN + k] = ROW(body_iquat, NB * 4)[b * 4 + k];

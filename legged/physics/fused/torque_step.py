@@ -36,7 +36,7 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
 
 @wp.struct
 class StateArrays:
-    """Arrays of mujoco-warp's model and data that the integration reads. It writes those from `qpos` on."""
+    """Arrays of mujoco-warp's model and data for the integration, which writes those from `qpos` on."""
 
     timestep: wp.array[float]
     jnt_type: wp.array[int]
@@ -127,7 +127,9 @@ def integrate(of: StateArrays):
 
 
 class TorqueStep:
-    """Launches a step, except contacts and constraint rows, which the caller computes between `begin` and `finish`."""
+    """Launches all stages of a step except contacts and constraint rows. The caller computes these between `begin` and
+    `finish`.
+    """
 
     def __init__(
         self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), active_set: ActiveSet | None = None
@@ -155,7 +157,9 @@ class TorqueStep:
         return SmoothDynamics.why_not(model, randomized)
 
     def begin(self) -> None:
-        """Compute the inputs of contacts and constraint rows, and all other forces, from qpos, qvel and ctrl."""
+        """Compute the inputs of contacts and constraint rows, and all forces except constraint forces, from qpos, qvel and
+        ctrl.
+        """
         self.dynamics.launch()
 
     def finish(self) -> None:

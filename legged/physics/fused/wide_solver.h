@@ -4,9 +4,9 @@
 // most WIDE. Constants: WIDE, NV (degrees of freedom), ROWS (largest number of constraint rows), ENTRIES (stored entries of
 // the mass matrix), DAMPED (dampers are integrated implicitly), KNOWN (rows have keys, with which their states of the last
 // step are found), FRICTION (there may be rows of dry friction), COUPLED (a row may move degrees of freedom of several
-// branches). Tables of the tree: PATH_START and PATH_LENGTH (NV each), the start and length in PATHS of each degree of
-// freedom's path from the root to itself; ENTRY_PLACE (ENTRIES), the place of each entry of the mass matrix among the entries
-// of all paths.
+// branches). Tables: PATHS (the path from the root to each degree of freedom), PATH_START and PATH_LENGTH (start and length
+// of each path in PATHS), ENTRY_PLACE (place of each entry of the mass matrix in a matrix whose rows have the entries of
+// PATHS).
 
 // A Wide holds a number for each world. A Mask holds an integer for each world: -1 (all bits set) for true, 0 for false.
 typedef float Wide __attribute__((vector_size(4 * WIDE), may_alias));

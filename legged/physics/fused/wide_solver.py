@@ -58,7 +58,7 @@ def fits_wide(nv: int, rows: int) -> bool:
 
 
 def wide_function(constants: dict[str, Constant]) -> Any:
-    """Return the kernel's device function, which computes one block: up to `WIDE` worlds from `start` on, all before `end`."""
+    """Return the kernel's device function. It computes one block: up to `WIDE` worlds from `start` on, all before `end`."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def solve_block(
@@ -75,7 +75,9 @@ def wide_function(constants: dict[str, Constant]) -> Any:
 
 
 def wide_kernel(constants: dict[str, Constant]) -> Any:
-    """Return the kernel for `wide_constants`, of dimension (blocks,). It computes the worlds `first` to `end - 1`."""
+    """Return the kernel for a set of `wide_constants`. Its launch dimension is (blocks,). A launch computes the worlds from
+    `first` to `end - 1`.
+    """
     solve_block = wide_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -64,7 +64,7 @@ class SolverFields:
             torch.tensor(own, dtype=torch.float32, device=device).repeat(worlds, 1, 1)
             for own in (model.actuator_gainprm, model.actuator_forcerange)
         )
-        """(N, D, 10) gains in the first column, and (N, D, 2) least and greatest torques [N m]."""
+        """`gains` (N, D, 10) holds gains in its first column, `limits` (N, D, 2) the least and greatest torques [N m]."""
         self.motors = bool(motors)
         """True if the motors change the torques that the task requests."""
         bodies = solver.mjc_body_to_newton.numpy()[0]
@@ -120,6 +120,6 @@ class SolverFields:
             self._variants.replace(made)
 
     def choose(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy into each world of `mask` (N,) the variant with its index in `chosen` (N,)."""
+        """Copy variant `chosen[i]` into world i, for each world in `mask`; both are (N,)."""
         if self._variants is not None:
             self._variants.launch(mask, chosen)

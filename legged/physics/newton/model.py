@@ -29,9 +29,10 @@ class Layout:
     shapes: np.ndarray
     """(S,) indices of the collision shapes, in the robot's order."""
     root_q: int
-    """Index of the free joint's first coordinate. Its coordinates are position, then orientation (x, y, z, w)."""
+    """Index of the free joint's first coordinate. The joint has a position, then an orientation (x, y, z, w)."""
     root_qd: int
-    """Index of the free joint's first velocity. Linear velocity of the base's centre of mass, then angular, world frame."""
+    """Index of the free joint's first velocity. The joint has the linear velocity of the base's centre of mass, then the
+    angular velocity, world frame."""
     dof_q: np.ndarray
     """(D,) indices of the joints' coordinates, in the robot's order."""
     dof_qd: np.ndarray

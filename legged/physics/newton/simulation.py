@@ -1,4 +1,4 @@
-"""A Newton solver with everything that one of its steps needs: states, contacts, substeps."""
+"""A Newton solver with its states, contacts and substeps."""
 
 import warnings
 from typing import Any
@@ -62,7 +62,7 @@ class Simulation:
         else:
             self.contacts = self._pipeline.contacts()
         self.lost: wp.array | None = None
-        """(N,) or longer: the solver's flags for dropped contacts or constraint rows; None if it has no such flags."""
+        """(N,) or longer: the solver's flags for dropped contacts or constraint rows; None if the solver has none."""
         self.lost_bits = 1
         """Bits of `lost` that mean that contacts or rows were dropped."""
         self._pushes: list[Any] | None = None

@@ -126,4 +126,4 @@ SOLVERS = {
         maximal=True,
     ),
 }
-"""`sim.solver` -> its setup. Where a solver supports it (`gap`), contacts begin slightly before shapes touch."""
+"""`sim.solver` -> its setup. With a solver that supports `gap`, contacts begin slightly before shapes touch."""

@@ -1,4 +1,4 @@
-"""Conversion between Newton's arrays and those of the task: conventions of states, and contact forces by shape.
+"""Conversion of states between Newton's conventions and the task's, and sums of contact forces on each shape.
 
 Newton's quaternions are (x, y, z, w). Its linear velocity is that of the body's centre of mass, and both its velocities are
 in the world frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear velocity is that of the
@@ -159,7 +159,7 @@ class NewtonStateIO(RobotStateIO):
         robot: Robot,
         state: RobotState,
     ) -> None:
-        """Prepare the launches. `task` is the task's qpos, qvel and ctrl. Warp's current device must be theirs."""
+        """Prepare the launches. `task` is the task's qpos, qvel and ctrl. Warp's current device must be that of the arrays."""
         self._qpos, self._qvel, self._torques = task
         count, layout = len(overflowed), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)

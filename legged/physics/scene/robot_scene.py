@@ -12,7 +12,7 @@ from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 UNTOUCHED = 1 << 30
-"""Collision type of a geom that collides with nothing. Without a collision type, MuJoCo would discard it as visual."""
+"""Collision type of a geom that collides with nothing. Without a collision type, MuJoCo would discard the geom as visual."""
 ROBOT, GROUND = 1, 2
 """Collision types: one bit each in MuJoCo's contype and conaffinity."""
 

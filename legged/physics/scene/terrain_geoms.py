@@ -12,8 +12,8 @@ from legged.terrain.terrain import Terrain
 
 DEPTH = 20.0
 """Distance from the lowest point of the map to the bottom of all geoms [m]. It is so large that nothing slips between two
-geoms. Unused points of a height field lie at the bottom. The flanks that lead down to them are nearly vertical: they deviate
-by less than 1 mm for each 0.2 m of height."""
+geoms. Points of a height field that no slope uses lie at the bottom. The flanks that lead down to them are nearly vertical:
+they deviate by less than 1 mm for each 0.2 m of height."""
 SKIN = 0.05
 """Distance of a colliding height field below the ground, along the ground's normal [m]. The geom has a margin of this size,
 so that shapes collide with it at the height of the ground.
@@ -117,7 +117,7 @@ class _Geoms:
 
     def surface(self, x: int, y: int, heights: np.ndarray, skin: float = 0.0) -> None:
         """Add a height field with points `heights` (X + 1, Y + 1) [m], which collides at a distance of `skin` [m]. The first
-        point lies at the outer corner of cell x, y.
+        point lies at the outer corner of cell (x, y).
         """
         half = [0.5 * (n - 1) * self.ground.cell for n in heights.shape]
         low, high = float(heights.min()), float(heights.max())
@@ -207,7 +207,7 @@ def _at_corners(points: np.ndarray) -> list[np.ndarray]:
 
 def _lattice(corners: np.ndarray, used: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean height [m] of the cells' corners at each lattice point, (X + 1, Y + 1), and a mask of the points at
-    which they differ. `corners` is (X, Y, 4).
+    which the corners differ. `corners` is (X, Y, 4).
 
     With `used` (X, Y), only used cells count. The mean is NaN at points without used cells.
     """

@@ -34,7 +34,7 @@ MOST_PROCESSES = 16
 TILED_COSTS = 20
 """Compiling a tiled kernel takes as long as this many ordinary kernels: it may need CUDA's linear algebra."""
 CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
-"""Threads per block that Warp uses by default. Each block size is compiled separately."""
+"""Numbers of threads per block that Warp uses by default. Warp compiles a module separately for each block size."""
 
 
 def cache_folder() -> Path:

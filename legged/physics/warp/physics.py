@@ -1,4 +1,4 @@
-"""Common base of the engines on Warp: writing and reading states, streams, and capture on the CPU."""
+"""Base class of the engines on Warp. It writes and reads states, handles streams, and captures steps on the CPU."""
 
 from abc import abstractmethod
 from collections.abc import Callable

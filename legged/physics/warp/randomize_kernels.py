@@ -89,9 +89,10 @@ def write_drawn(
     ratios: wp.array[float],
     to: Arrays,
 ):
-    """Compute the randomised numbers of the worlds in `mask`: the fields change the model's own number one after the other.
-    `threads` threads per world share the numbers. `place` holds the array of each number and its position there. `entry`
-    holds, for each change, the column of the value, the operation, and the conversion from restitution.
+    """Compute the randomised numbers of the worlds in `mask`: each is the model's own number, to which the changes of all
+    fields are applied in turn. `threads` threads per world share the numbers. `place` holds the array of each number and its
+    position there. `entry` holds, for each change, the column of the value, the operation, and the conversion from
+    restitution.
     """
     world, thread = wp.tid()
     if not mask[world]:
@@ -205,8 +206,8 @@ class Variants:
     """Model variants with derived constants. Each world takes one of them."""
 
     def __init__(self, arrays: Mapping[str, tuple[Tensor, Tensor]]) -> None:
-        """`arrays` has the variants (K, ...) and the worlds' array (N, ...) of each name. Warp's current device must be
-        theirs.
+        """Prepare to copy variants. `arrays` holds, for each name, the variants (K, ...) and the worlds' array (N, ...).
+        Warp's current device must be that of the tensors.
         """
         self._variants = self._side_by_side({name: made for name, (made, _) in arrays.items()})
         widths = [made[0].numel() for made, _ in arrays.values()]
@@ -225,6 +226,6 @@ class Variants:
         self._variants.copy_(self._side_by_side(made))
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy into each world of `mask` (N,) the variant with its index in `chosen` (N,)."""
+        """Copy variant `chosen[i]` into world i, for each world in `mask`; both are (N,)."""
         inputs = [self._dim[1], wp.from_torch(mask), wp.from_torch(chosen), *self._inputs]
         wp.launch(copy_variants, dim=self._dim, inputs=inputs)

@@ -114,8 +114,8 @@ def write_states(
     warmstart: wp.array2d[float],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """Write the states of the worlds in `mask`, and clear the solver's and the actuators' memory: controls, activations, warm
-    start and contact forces. `lanes` threads per world.
+    """Write the states of the worlds in `mask`, and clear their controls, activations, warm starts and contact forces.
+    `lanes` threads per world.
     """
     world, lane = wp.tid()
     if not mask[world]:
@@ -163,7 +163,9 @@ class StateIO:
     """Launches of the kernels that write states and read kinematics, on fixed arrays, so that a graph can capture them."""
 
     def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
-        """Prepare for a model without a robot: only `overflowed` (N,) is read. Warp's current device must be the arrays'."""
+        """Prepare for a model without a robot: only `overflowed` (N,) is read. Warp's current device must be that of the
+        arrays.
+        """
         self._arrays = arrays
         self._overflowed = wp.from_torch(overflowed)
         self._contact_forces = wp.zeros((len(overflowed), 0), dtype=wp.vec3)

@@ -202,7 +202,9 @@ def scan_heights(
     heights: wp.array2d[float],
     ground: wp.array[float],
 ):
-    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base."""
+    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base's
+    position.
+    """
     robot, point = wp.tid()
     w, x, y, z = base_quat[robot, 0], base_quat[robot, 1], base_quat[robot, 2], base_quat[robot, 3]
     yaw = wp.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -272,9 +274,9 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """Add up the rewards of all terms, which are the rows of arrays. One thread per robot. Terms are processed in groups of
-    four, so that all reads of a group precede its writes and wait for memory together: the compiler moves no read ahead of a
-    write.
+    """Add up the rewards of all terms. One thread per robot; each row of an array belongs to a term. Terms are processed in
+    groups of four, so that all reads of a group precede its writes and wait for memory together: the compiler moves no read
+    ahead of a write.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -359,7 +361,9 @@ class TaskKernels(Launcher):
         self.launch(vary_control, tuple(arguments[-1].shape), arguments)
 
     def disturb(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Disturbances.act`. It finds kicks, and writes forces to the last argument (N, bodies, 6)."""
+        """Launch the kernel of `Disturbances.act`. It writes the forces to the last argument (N, bodies, 6). It also
+        determines the kicks, which the caller then applies.
+        """
         total: Tensor = arguments[-1]  # type: ignore[assignment]
         self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
 
