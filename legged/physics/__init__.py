@@ -41,8 +41,8 @@ longer than its faster steps save."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:
-    """Return the name of the engine that runs on a device. `auto` means mujoco_warp on a GPU, and on a CPU for `MANY_WORLDS`
-    or more; otherwise it means the C engine. Error messages begin with `where`, the setting's dotted path.
+    """Return the name of the engine that runs on a device. `auto` means mujoco_warp on a GPU, or on a CPU with at least
+    `MANY_WORLDS` worlds; otherwise it means the C engine. Error messages begin with `where`, the setting's dotted path.
 
     On a CPU, only mujoco_warp's fused step is faster than the C engine. If the fused step does not support a model, `auto`
     makes `make_physics` return the C engine.
@@ -63,7 +63,7 @@ def engine_name(sim: SimConfig, device: torch.device, where: str = "sim.physics"
     """Return the name of the engine for files and tables: mujoco, mujoco_warp, or newton_<solver>.
 
     Raises:
-        ConfigError: as `resolve_physics`.
+        ConfigError: see `resolve_physics`.
     """
     engine = resolve_physics(sim.physics, device, where, num_envs)
     return f"newton_{sim.solver}" if engine == "newton" else engine
@@ -133,7 +133,7 @@ def make_physics(
         pushed: True if the task applies external forces to bodies (`Physics.forces`).
 
     Raises:
-        ConfigError, ValueError: as `check_engine`.
+        ConfigError, ValueError: see `check_engine`.
     """
     check_engine(scene, sim, device, where, randomized, quantities)
     engine = resolve_physics(sim.physics, device, num_envs=num_envs)

@@ -15,9 +15,9 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class FootChains:
-    """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), ordered from the foot to the
-    base; lengths are in metres. Each hinge has its own frame, in which `axis` and `anchor` are given. `body_pos` and
-    `body_quat` are the pose of this frame at angle 0 in the frame of the next hinge.
+    """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), with levels ordered from the
+    foot to the base; lengths are in metres. Each hinge has its own frame, in which `axis` and `anchor` are given. `body_pos`
+    and `body_quat` are the pose of this frame at angle 0 in the frame of the next hinge.
     """
 
     offset: np.ndarray

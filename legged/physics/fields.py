@@ -52,8 +52,8 @@ def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
 
 
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return `-per_gear` for actuators with an affine bias, 0 for others, (nu,). A position servo keeps its target if
-    `per_gear` is added to its gain and this number to its position bias.
+    """Return the change of position bias that belongs to a change of gain by `per_gear`, for each actuator, (nu,):
+    `-per_gear` with an affine bias, otherwise 0. With both changes, a position servo keeps its target.
     """
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
 
@@ -71,8 +71,8 @@ class Change:
     least: float | None = 0.0
     """Smallest allowed number in the array; None for no limit."""
     bounce: Literal["", "ratio", "inverse"] = ""
-    """"ratio" if values are restitutions and the array takes their damping ratios, "inverse" if it takes 1 / damping ratio.
-    Empty if values are not restitutions."""
+    """Conversion of restitutions: the array takes their damping ratios ("ratio"), or 1 / damping ratio ("inverse"). Empty if
+    the values are not restitutions."""
 
 
 @dataclass(frozen=True)

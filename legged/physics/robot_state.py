@@ -38,8 +38,8 @@ class RobotState:
     feet_vel: Tensor
     """(N, F, 3) velocities of the feet's centres, world frame [m/s]."""
     contact_forces: Tensor
-    """(N, B, 3) sum of the contact forces on each collision shape, or on all shapes of a foot, world frame, at the last
-    physics step [N]; zero after a reset."""
+    """(N, B, 3) contact force [N] on each collision shape, or on all shapes of a foot together, world frame, in the last
+    physics step; zero after a reset."""
 
 
 class DrivenJoints:

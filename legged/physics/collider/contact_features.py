@@ -25,8 +25,8 @@ AT, BETWEEN, RIM, DISC = (wp.constant(k) for k in range(4))
 `end[0]`, perpendicular to the shape's z axis."""
 
 LENGTHWISE = wp.constant(0.1)
-"""Smallest cosine of the angle between a rim of the terrain and a cylinder's axis for which contacts of this rim with the
-cylinder's end discs are computed."""
+"""A rim of the terrain can touch the end discs of a cylinder only if the cosine of the angle between the rim and the
+cylinder's axis is larger than this."""
 
 
 @dataclass(frozen=True)

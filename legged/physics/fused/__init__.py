@@ -2,4 +2,4 @@
 
 from legged.physics.warp import settings
 
-__all__ = ["settings"]  # must be imported before a module here declares a kernel
+__all__ = ["settings"]  # `settings` must be imported before any module here declares a kernel

@@ -99,7 +99,7 @@ NAMES = {
 
 @wp.struct
 class Candidates:
-    """Candidates for contacts: points of shapes on planes, pairs of spheres and capsules, and contact features above the
+    """Candidates for contacts: points of shapes above planes, pairs of spheres and capsules, and contact features above a
     height map. Arrays `*_touch` hold the index of the candidate's `ContactPair`.
     """
 

@@ -1,4 +1,4 @@
-"""Contacts and all constraint rows in one launch: one warp of threads per world.
+"""Contacts and all constraint rows in one launch. One warp of threads computes each world.
 
 mujoco-warp needs about ten launches, and keeps the contacts of all worlds in one pool, in the order in which threads append
 them. Here each world has its own slots in mujoco-warp's contact arrays. Slots are filled in the order of the shapes. Indices

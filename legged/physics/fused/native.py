@@ -6,7 +6,7 @@ from typing import Any
 
 SOURCES = Path(__file__).parent
 LANES = 32
-"""Number of threads per world on a GPU; on the CPU it is 1."""
+"""Number of threads per world on a GPU. On a CPU there is one thread."""
 SHARED_BYTES = 48 * 1024
 """Shared memory available to a block of threads [bytes]."""
 Constant = int | bool | tuple[int, ...]

@@ -255,7 +255,7 @@ class SmoothDynamics:
         return _why_not_motors(model, _scalar(model))
 
     def launch(self) -> None:
-        """Compute everything that precedes collision detection in a step."""
+        """Compute everything that a step needs before collision detection."""
         dim = (self._worlds, self._lanes)
         wp.launch(self._kernel, dim=dim, inputs=[self.arrays], block_dim=self._lanes)
 

@@ -4,7 +4,8 @@ mujoco-warp launches a stage for every feature that a model might have: gravity 
 lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing, which
 adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` returns the first
 feature of a model that this step does not support. External forces on bodies (`xfrc_applied`) are applied if they were
-requested. `qfrc_applied`, sensors, and the poses of bodies, sites and cameras are not computed.
+requested. The step ignores `qfrc_applied`. It does not compute sensors or cameras, and computes poses of bodies and sites
+only if equality constraints need them.
 """
 
 from collections.abc import Collection

@@ -18,7 +18,7 @@ GPU lane can hold two degrees of freedom."""
 
 @dataclass(frozen=True)
 class Tree:
-    """Parent of each degree of freedom in the elimination tree. Parents precede their children."""
+    """Elimination tree, stored as the parent of each degree of freedom. Parents precede their children."""
 
     parent: np.ndarray
     """(nv,) index of the parent; -1 for roots."""

@@ -1,8 +1,8 @@
 """Randomisation in Newton's MuJoCo solver, by writing into the arrays of its internal mujoco-warp model.
 
-Newton's own arrays contain only friction and masses, and notifying the solver of a change is not possible within a captured
-step. The solver's internal arrays have one row per world, under MuJoCo's names. Motors are not part of the solver: their
-torques are applied to joints.
+Newton's own arrays contain only friction and masses, and a captured step cannot notify the solver of changes. The solver's
+internal arrays have one row per world, under MuJoCo's names. Motors are not part of the solver: their torques are applied to
+joints.
 """
 
 from collections.abc import Collection, Mapping

@@ -89,7 +89,7 @@ class NewtonPhysics(WarpPhysics):
         self._simulation.forget(self._wp_mask)
 
     def _put(self) -> None:
-        """Copy the task's state of the worlds of `_mask` to Newton's joints and bodies."""
+        """Copy the task's state to Newton's joints and bodies, in the worlds of `_mask`."""
         self._state_io.put(self._wp_mask)
         self._simulation.place_bodies(self._wp_mask)
 

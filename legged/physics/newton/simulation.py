@@ -38,7 +38,7 @@ class Simulation:
         """Build the scene and its solver. `device` is a Warp device, and must be Warp's current one.
 
         Raises:
-            ConfigError: as `build_newton_model`.
+            ConfigError: see `build_newton_model`.
         """
         self.setup = setup = SOLVERS[sim.solver]
         self.model, self.layout = build_newton_model(robot, setup, sim, num_envs, terrain, device)
@@ -85,7 +85,7 @@ class Simulation:
         TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
 
     def _request(self) -> SolverBase.Observables | None:
-        """Return the arrays that the solver fills in each step besides the state; None if there are none."""
+        """Return the arrays that the solver fills in each step besides the state, or None without such arrays."""
         solver, kinds = self.solver, set()
         if self.setup.springs is None:
             kinds.add(solver.ObservableKind.CONTACT_F)

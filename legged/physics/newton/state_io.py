@@ -159,7 +159,7 @@ class NewtonStateIO(RobotStateIO):
         robot: Robot,
         state: RobotState,
     ) -> None:
-        """Prepare the launches. `task` is the task's qpos, qvel and ctrl. Warp's current device must be that of the arrays."""
+        """Prepare the launches. `task` holds qpos, qvel and ctrl. Warp's current device must be that of the arrays."""
         self._qpos, self._qvel, self._torques = task
         count, layout = len(overflowed), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)

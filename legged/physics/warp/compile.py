@@ -29,7 +29,7 @@ from filelock import lock_descriptor, unlock_descriptor
 POLL_S = 0.1
 PLAIN_LINES_EVERY_S = 5.0
 STALLED_S = 300.0
-"""Time without a finished module after which compiling processes are ended [s]."""
+"""Compiling processes are ended if they finish no module for this time [s]."""
 MOST_PROCESSES = 16
 TILED_COSTS = 20
 """Compiling a tiled kernel takes as long as this many ordinary kernels: it may need CUDA's linear algebra."""
@@ -83,12 +83,12 @@ def compile_ahead(device: Any, functions: Iterable[Callable[[], object]]) -> int
 
 
 def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Build]:
-    """Return the modules that `functions` launch on a device, slowest to compile first."""
+    """Return the modules that `functions` launch on a device. The slowest to compile come first."""
     found: dict[Build, int] = {}
 
     def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, tiled: bool = False, **__: Any) -> None:
         if kernel.is_generic or math.prod(dim if isinstance(dim, list | tuple) else (dim,)) == 0:
-            return  # a generic kernel is compiled as another kernel, for its argument types
+            return  # Warp compiles an instance of a generic kernel for the argument types, which is not known here
         size = CPU_BLOCK_DIM if device.is_cpu else block_dim or CUDA_BLOCK_DIM
         found[Build(kernel.module, size)] = TILED_COSTS * tiled + len(kernel.module.kernels)
 

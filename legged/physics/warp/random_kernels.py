@@ -1,4 +1,4 @@
-"""Kernels that resample randomised values within a step, push robots, and change height-map errors. legged/mdp has the same
+"""Kernels that resample randomised values within a step, push robots, and update height-map errors. legged/mdp has the same
 formulas in torch.
 
 The kernels have a separate module, so that training without randomisation does not compile them.

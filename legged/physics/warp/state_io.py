@@ -196,7 +196,7 @@ class StateIO:
 
 
 class RobotStateIO(StateIO, ABC):
-    """Launches for a robot with a floating base and feet."""
+    """Launches of the kernels for a robot with a floating base and feet."""
 
     def __init__(
         self, arrays: EngineArrays, overflowed: torch.Tensor, model: mujoco.MjModel, robot: Robot, state: RobotState
@@ -233,7 +233,7 @@ class RobotStateIO(StateIO, ABC):
 
 
 class MujocoWarpStateIO(RobotStateIO):
-    """Launches for a robot in mujoco-warp, with its contact forces."""
+    """Launches of the kernels for a robot in mujoco-warp, including contact forces."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Kernels of those parts of a task whose formula is fixed. Each replaces 6 to 20 torch operations by one launch.
+"""Kernels for the parts of a task that have a fixed formula. Each kernel replaces 6 to 20 torch operations by one launch.
 
 The C engine runs the same formulas in torch, in `legged/mdp/`; a test checks that both are bit-identical.
 """
