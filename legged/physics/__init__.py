@@ -98,7 +98,7 @@ def check_engine(
     if scene.robot.passive is not None:
         raise ConfigError(
             f"{where('sim.physics')}: newton does not simulate the joints of '{scene.robot.name}' that no motor drives"
-            f" (passive_joints), and their loops; use {others}"
+            f" (passive_joints) or the loops that they close; use {others}"
         )
     for field in randomized:
         if sim.solver != "mujoco" and field not in NEWTONS_FIELDS:

@@ -43,8 +43,8 @@ class RobotState:
 
 
 class DrivenJoints:
-    """Copies the angles and velocities of the driven joints out of the generalised coordinates, for robots whose passive
-    joints lie between them. For other robots RobotState has views, and nothing is copied.
+    """Copies angles and velocities of driven joints from the generalised coordinates if passive joints lie between driven
+    ones. For all other robots, RobotState has views, and nothing is copied.
     """
 
     def __init__(self, qpos: Tensor, qvel: Tensor, state: RobotState, robot: Robot) -> None:

@@ -1,4 +1,4 @@
-"""Test of PD gains: the height at which a robot stands in C MuJoCo."""
+"""Test of PD gains by the height at which a robot stands in C MuJoCo."""
 
 import mujoco
 import numpy as np

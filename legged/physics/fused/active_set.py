@@ -3,8 +3,8 @@
 The cost of a row is piecewise, and the row's state names the piece that applies. A row of a contact or a limit exerts force
 or does not. A row of dry friction holds, or slips in one of two directions. Newton's method has converged when all states are
 right. It takes four iterations if it starts only from the last step's acceleration: the forces of stiff contacts depend on
-small differences of accelerations, and from step to step accelerations change by more. The states seldom change, so a start
-from them saves half of the iterations and nearly all line searches.
+small differences of accelerations, and from step to step accelerations change by more than these differences. The states
+seldom change, so a start from them saves half of the iterations and nearly all line searches.
 """
 
 from dataclasses import dataclass

@@ -75,7 +75,7 @@ class Simulation:
         """(contacts,) force on the first shape of each contact in the last substep, world frame [N]."""
 
     def _add_cell_collider(self, terrain: Terrain) -> None:
-        """Register mujoco_warp's height-map collider, with vertical faces, in Newton's MuJoCo solver."""
+        """Register the height-map collider, which keeps vertical faces, in Newton's MuJoCo solver."""
         solver = self.solver
         assert isinstance(solver, SolverMuJoCo)
         model = solver.mj_model

@@ -144,7 +144,7 @@ class _Geoms:
 
 
 def _attributes(material: str | None, collide: bool) -> dict[str, Any]:
-    """Return the attributes of all geoms of a terrain. Their collision bits match the robot's shapes but not each other."""
+    """Return the attributes of a terrain's geoms. With `collide`, these collide with the robot, but not with each other."""
     bits = {"contype": 2, "conaffinity": 1} if collide else {"contype": 0, "conaffinity": 0}
     return {**bits, "group": 0} | ({"material": material} if material else {})
 

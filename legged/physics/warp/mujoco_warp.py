@@ -71,7 +71,9 @@ def ignored(model: mujoco.MjModel) -> str:
 
 
 class NoBlocks(Exception):
-    """Error for a model whose step cannot run in blocks of worlds. On a CPU, only blocks are faster than the C engine."""
+    """Error for a model whose step cannot run in blocks of worlds. On a CPU, only a step in blocks is faster than the C
+    engine.
+    """
 
 
 class MujocoWarpPhysics(WarpPhysics):

@@ -145,7 +145,9 @@ def follow_commands(
     share: wp.array[float],
     reached: wp.array3d[float],
 ):
-    """For each command that counts, compute its size and the velocity in its direction. One thread per robot and axis."""
+    """For each command above half of its current limit, compute its size and the velocity in its direction; for all others,
+    zeros. One thread per robot and axis.
+    """
     robot, axis = wp.tid()
     command = commands[robot, axis]
     size = wp.abs(command)
