@@ -14,7 +14,7 @@ TIMING_FILE = "timing.json"
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of one training process, with the work done in them."""
+    """Times of one training process, and the amount of its work."""
 
     task: str
     finished: bool
