@@ -102,7 +102,7 @@ class ForbidHostReads:
         if kind is None:
             self._judge_state(self._state)
             if self.compares and len(self._record) != len(self._record_before):
-                raise HostReadError("the step makes fewer calls than the previous step; a CUDA graph would repeat them all")
+                raise HostReadError("the step makes fewer calls than the previous step; a CUDA graph would repeat all recorded calls")
 
     @contextmanager
     def recording(self) -> Iterator[None]:
@@ -230,7 +230,7 @@ class Seen:
     call: str
     """Name of the operator and its arguments other than tensors."""
     memory: dict[int, StorageWeakRef]
-    """Identifier -> reference to memory, for the argument tensors that the step itself did not make. While such a reference
+    """Memory of the argument tensors that the step itself did not make: identifier -> weak reference. While such a reference
     exists, no later tensor gets the same identifier."""
 
 

@@ -81,7 +81,7 @@ class StepGraph:
         """
         self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
-        # A function that repeats the same work needs one check. For a single step, several runs are compared.
+        # One check is enough if the function repeats the same work. Otherwise several runs of it are compared.
         self._checks = ForbidHostReads.STEPS if rehearse is None else 1
         self._guard = ForbidHostReads(device, getattr(function, "__self__", None))
         if not enabled:
@@ -134,7 +134,7 @@ class StepGraph:
                         failure = error
                         raise
         except Exception as error:
-            failure = failure or error  # the end of a broken capture fails too; that error would hide the cause
+            failure = failure or error  # ending a broken capture raises another error, which hides the cause
         if failure is not None:
             raise failure
         return graph
