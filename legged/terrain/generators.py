@@ -1,4 +1,4 @@
-"""Tiles of terrain. A small NumPy function makes each type. Names and sizes are legged_gym's (arXiv 2109.11978).
+"""Tiles of terrain. A small NumPy function makes each type. Names and sizes mostly follow legged_gym (arXiv 2109.11978).
 
 Every generator takes a `Tile` of zeros and a size that depends on the difficulty, in metres or degrees, and fills in the
 heights of the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
