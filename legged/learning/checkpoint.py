@@ -39,7 +39,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
     it runs.
 
     Raises:
-        ConfigError: the file can't be read, is not a torch file, or holds anything else.
+        ConfigError: the file can't be read, is not a torch file, or holds other than plain data.
     """
     name = relative(path)
     try:

@@ -66,7 +66,7 @@ class Progress:
     """Log entries of the task: rewards `rew_<term>` (per second of a full episode), `Metrics/...` and other sections. An
     entry without a value so far is NaN."""
     behavior: float | None = None
-    """Mean loss between a student's actions and its teacher's; None without a teacher."""
+    """Mean loss between the actions of a student and of its teacher; None without a teacher."""
 
     def metrics(self) -> dict[str, float]:
         """Return the task's metrics by name, those of `STYLES` first."""
@@ -121,7 +121,7 @@ class Progress:
         return "".join(f"  estimated {plain(name)} {value:.3f}" for name, value in found)
 
     def levels(self) -> dict[str, str]:
-        """Return, for each terrain type, its mean level and the shares of episodes that moved up and down."""
+        """Return terrain type -> text with its mean level and the shares of episodes that moved up and down."""
         found = {}
         for key, level in self.values.items():
             name = key.removeprefix("Terrain/level_")

@@ -28,7 +28,7 @@ class DeviceDistillation(Distillation):
     def __init__(self, student: MLPModel, teacher: MLPModel, *args: Any, stock: bool = False, **kwargs: Any) -> None:
         for parameter in student.distribution.parameters():  # no loss depends on the noise of the student's actions
             parameter.requires_grad_(False)
-        with warnings.catch_warnings():  # the configuration excludes the left-over steps of which rsl-rl warns
+        with warnings.catch_warnings():  # no warning of gradient_length: the configuration has checked it
             warnings.simplefilter("ignore")
             super().__init__(student, teacher, *args, **kwargs)
         name = kwargs.get("optimizer", "adam")

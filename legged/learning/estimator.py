@@ -120,7 +120,7 @@ class EstimationErrors:
             self._shares[term.columns, i] = 1.0 / (term.columns.stop - term.columns.start)
 
     def squares(self, estimates: Tensor, targets: Tensor) -> Tensor:
-        """Return the mean square error (n, terms) of each sample and term. `estimates` and `targets` (n, E) are both
-        scaled.
+        """Return the mean square error (n, terms) of each sample and term. `estimates` and `targets` (n, E) both have the
+        terms' scales.
         """
         return ((estimates - targets).square() * self._factors) @ self._shares

@@ -80,7 +80,7 @@ class QuietLogger(Logger):
             self.writer.close()
 
     def hand_over(self, iteration: int) -> None:
-        """Give the videos and reports in the run folder to the tracker, if there is one, and close it."""
+        """Give the videos and reports in the run folder to the tracker, if there is one, and close the tracker."""
         if isinstance(self.writer, Tracker):
             self.writer.hand_over(Path(self.log_dir), iteration)
 

@@ -73,8 +73,8 @@ def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
 
 
 def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:
-    """Build the policy's network alone, on the CPU. Only the shapes of `observations` matter. The random numbers of the
-    caller stay the same.
+    """Build the policy's network alone, on the CPU. Only the shapes of `observations` matter. The CPU's random generator
+    keeps its state.
     """
     settings = network_settings(cfg)
     kind, rest = resolve_class(settings["actor"])

@@ -245,7 +245,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples. It comes from a sort, because a graph can hold a sort."""
+        """Return a random permutation of `count` samples. It comes from sorting random numbers, which a graph can hold."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(

@@ -53,7 +53,7 @@ def create_run(cfg: TaskConfig) -> Path:
         try:
             folder.mkdir()
             break
-        except FileExistsError:  # two runs in one second
+        except FileExistsError:  # another run began in this second
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error

@@ -179,8 +179,7 @@ class Runner(OnPolicyRunner):
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # A process without evaluations learns from the first process that training has ended. With several processes the
-            # only reason is a reached target.
+            # Processes without evaluations get Ended too. With several processes it means that the target is reached.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -367,8 +366,7 @@ class Runner(OnPolicyRunner):
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
-        """Return the sum of rewards and the length so far of each environment's episode, (N,) each, as counted for the
-        log.
+        """Return the sum of rewards and the length of each environment's episode so far, (N,) each, as counted for the log.
         """
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 

@@ -27,7 +27,7 @@ class Timing:
     steps: int
     """Control steps of all robots."""
     start_up_s: float
-    """Time until everything was built, with imports and the compilation of kernels [s]."""
+    """Time until everything was built, including imports and the compilation of kernels [s]."""
     loop_s: float
     """Time in iterations [s]. It includes logging, except in rsl-rl's own loop."""
     wall_s: float

@@ -131,7 +131,7 @@ class Tracker(LogWriter):
         self._tensorboard.close()
 
     def hand_over(self, folder: Path, iteration: int) -> None:
-        """Give the tracker the videos and reports of a run folder, then close it."""
+        """Give the tracker the videos and reports of a run folder, then close the tracker."""
         for pattern in FILES:
             for path in sorted(folder.glob(pattern)):
                 self.save_file(str(path))

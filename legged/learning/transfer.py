@@ -87,7 +87,7 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
     """Compare the observations and actions of a built task, including their widths, with those of a checkpoint.
 
     Raises:
-        ConfigError: they differ.
+        ConfigError: the observations or the actions differ.
     """
     cfg = task.cfg
     here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
