@@ -102,7 +102,7 @@ class ForbidHostReads:
         if kind is None:
             self._judge_state(self._state)
             if self.compares and len(self._record) != len(self._record_before):
-                raise HostReadError("the step makes fewer calls than the previous step; a CUDA graph would repeat all recorded calls")
+                raise HostReadError("the step makes fewer calls than the previous one; a CUDA graph repeats every call")
 
     @contextmanager
     def recording(self) -> Iterator[None]:
