@@ -51,7 +51,7 @@ def resumed(
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
-        raise ConfigError(f"{relative(path)}: holds no optimiser, so it can be played, but its training can't be resumed")
+        raise ConfigError(f"{relative(path)}: holds no optimiser, so its training can't be resumed; the policy can be played")
     check_optimizer(path, saved, cfg)
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:

@@ -366,8 +366,7 @@ class Runner(OnPolicyRunner):
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
-        """Return the sum of rewards and the length of each environment's episode so far, (N,) each, as counted for the log.
-        """
+        """Return the sum of rewards and the length of each environment's episode so far, (N,) each, for the log."""
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 
     def _memory(self) -> dict[str, Tensor]:
