@@ -22,7 +22,7 @@ class Constants:
     def __init__(self) -> None:
         self._made: dict[Any, Tensor] = {}
         self.complete = False
-        """True once all constants exist. If the step then needs a new one, a number changes from step to step."""
+        """True once all constants exist. If the step then needs a new one, its numbers change from step to step."""
         self.making = False
         """True while a constant is being made."""
 
@@ -30,7 +30,7 @@ class Constants:
         return len(self._made)
 
     def get(self, key: Any, make: Callable[[], Tensor]) -> Tensor:
-        """Return the constant of a key, and make it first if it is missing.
+        """Return the constant of `key`. If it is missing, make it first.
 
         Raises:
             HostReadError: the constant is missing, although all constants should exist (`complete`).
@@ -78,7 +78,7 @@ class Constants:
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 
     def _positions(self, tensor: Tensor, index: Any, part: Any) -> tuple[Any, ...]:
-        """Return the replacement for one part of an index."""
+        """Return the parts that replace `part` in an index of `tensor`; a list of bools gives one for each dimension."""
         elsewhere = isinstance(part, Tensor) and part.device != tensor.device
         if not elsewhere and not isinstance(part, list | tuple | range | np.ndarray):
             return (part,)
@@ -89,7 +89,7 @@ class Constants:
                 with self._free():
                     torch.empty(1, device="cpu").expand(tensor.shape).__getitem__(index)
             return tuple(self._constant(rows, tensor.device) for rows in np.nonzero(array))
-        if array.size and (array.dtype.kind not in "iu" or array.dtype == np.uint8):  # torch takes bytes for bools
+        if array.size and (array.dtype.kind not in "iu" or array.dtype == np.uint8):  # torch reads bytes as bools
             return (part,)
         return (int(array),) if array.ndim == 0 else (self._constant(array, tensor.device),)
 
@@ -106,7 +106,7 @@ def _is_number(part: Any) -> bool:
 
 
 def _dimensions(part: Any) -> int:
-    """Return how many dimensions of a tensor a part of an index consumes."""
+    """Return the number of a tensor's dimensions that one part of an index uses up."""
     if part is None or part is Ellipsis or isinstance(part, bool):
         return 0
     is_mask = isinstance(part, Tensor | np.ndarray) and part.dtype in (torch.bool, torch.uint8, np.bool_)

@@ -34,8 +34,8 @@ _active: "ForbidHostReads | None" = None
 
 @contextmanager
 def calling(term: str) -> Iterator[None]:
-    """Name `term` in the error if the block fails, also during a capture. Under the guard, also check that the term leaves
-    the Python state unchanged.
+    """Run the block as the term `term`. If the block fails, also in a capture, the error names the term. While the guard is
+    active, also check that the term leaves the Python state unchanged.
     """
     try:
         with _active.inside(term) if _active is not None else nullcontext():
@@ -54,15 +54,15 @@ class ForbidHostReads:
 
     If the same step runs several times, the guard also compares each run from the third on with the run before it. The
     attributes of `owner` other than tensors must not change. The numbers passed to torch must be the same. The step must not
-    read a tensor that the previous step allocated, because a graph goes on reading the memory of its capture. A tensor may be
-    allocated, kept as an attribute, and read outside the step or later in the same step. The first two runs may set up
+    read a tensor that the previous step allocated, because a graph goes on reading the memory of its capture. But it may keep
+    a tensor as an attribute and read it later in the same step, or outside the step. The first two runs may set up
     attributes.
 
-    The physics engines of this package are exempt. Engines on the host work on numpy arrays and are never captured.
+    The physics engines of this package are exempt. Those on the host work on numpy arrays, but are never captured.
     """
 
     STEPS = 3
-    """Number of runs that complete all checks."""
+    """Number of runs after which every check has been made."""
 
     def __init__(self, device: torch.device | None = None, owner: Any = None) -> None:
         """Guard a step of the task `owner` on `device`, by default the CPU."""
@@ -102,11 +102,11 @@ class ForbidHostReads:
         if kind is None:
             self._judge_state(self._state)
             if self.compares and len(self._record) != len(self._record_before):
-                raise HostReadError("the step makes fewer calls than the previous step; a CUDA graph would repeat them all")
+                raise HostReadError("the step makes fewer calls than the previous one; a CUDA graph repeats every call")
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Refuse new constants in the block, which captures a graph, because all constants of the step exist already."""
+        """Refuse new constants in the block, because it captures a graph and all constants exist already."""
         self.constants.complete = True
         with self._calls:
             yield
@@ -125,7 +125,7 @@ class ForbidHostReads:
         """Raise an error, unless a physics engine of this package makes the call.
 
         Raises:
-            HostReadError: with that reason.
+            HostReadError: the text begins with `reason`.
         """
         if not self.constants.making and not caller().startswith("legged.physics"):
             raise HostReadError(f"{reason}; a CUDA graph cannot hold that")
@@ -149,7 +149,7 @@ class ForbidHostReads:
                     " keep it in a tensor, and write the tensor in place"
                 )
 
-    # ---- what the modes see ----------------------------------------------------------------------------------------------
+    # ---- calls by _Operators ---------------------------------------------------------------------------------------------
 
     def run(self, func: Any, args: Any, kwargs: Any) -> Any:
         """Run one operator, and compare it with the operator in the same place of the previous step."""
@@ -202,16 +202,16 @@ class ForbidReads(TorchDispatchMode):
     """Dispatch mode that refuses, in its block, operators that read certain tensors or parts of them."""
 
     def __init__(self, tensors: Mapping[str, Tensor], reason: str) -> None:
-        """Refuse reads of `tensors`, a map from the name that an error gives. The `reason` follows the name."""
+        """Refuse reads of `tensors` (name -> tensor). The error gives the name and, after it, the `reason`."""
         super().__init__()
         self._names = {memory_of(tensor): name for name, tensor in tensors.items()}
         self._reason = reason
 
     def judge(self, value: Any) -> None:
-        """Check that a value holds none of the tensors.
+        """Check that a value holds none of the forbidden tensors.
 
         Raises:
-            HostReadError: it holds one.
+            HostReadError: the value holds one of them.
         """
         for part in tree_leaves(value):
             memory = memory_of(part)
@@ -230,8 +230,8 @@ class Seen:
     call: str
     """Name of the operator and its arguments other than tensors."""
     memory: dict[int, StorageWeakRef]
-    """Memory of the argument tensors that the step itself did not make. While such a reference exists, no later tensor gets
-    the same identifier."""
+    """Memory of the argument tensors that the step itself did not make: identifier -> weak reference. While such a reference
+    exists, no later tensor gets the same identifier."""
 
 
 def memory_of(value: Any) -> int | None:
@@ -303,7 +303,7 @@ class _Operators(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        with self:  # decompose: in inference mode, composite operators (item, one-argument where) arrive whole
+        with self:  # in inference mode composite operators, such as item, arrive in one piece
             result = func.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
@@ -316,7 +316,7 @@ class _Operators(TorchDispatchMode):
         """Return why the operator is refused; empty if it is allowed."""
         if func in (aten.index.Tensor, aten.index_put_.default, aten.index_put.default):
             if any(i is not None and i.dtype in (torch.bool, torch.uint8) for i in args[1]):
-                return "indexes by a mask, whose size is unknown; use torch.where or masked_fill"
+                return "indexes by a mask, so the result's size is unknown; use torch.where or masked_fill"
             return ""
         if func is aten.lift_fresh.default and args[0].dim() > 0:
             return "makes a tensor of the host's numbers; torch.tensor(..., device=self.device) makes it on the device"
@@ -331,7 +331,7 @@ class _Operators(TorchDispatchMode):
 
 
 class _Calls(TorchFunctionMode):
-    """Function mode that sees Python's calls of torch, and replaces the host's numbers by constants."""
+    """Function mode that sees Python's calls of torch, and replaces numbers of the host by cached constants."""
 
     REASONS = {
         Tensor.cpu: "copies to the host (.cpu())",
@@ -358,7 +358,7 @@ class _Calls(TorchFunctionMode):
         elif func is Tensor.to and self._is_host(*args[1:], *kwargs.values()):
             guard.refuse('copies to the host (.to("cpu"))')
         elif func is Tensor.type and args[1:] and not isinstance(args[1], torch.dtype):
-            guard.refuse("copies to the host (.type with a CPU type); .to(torch.int64) does not, nor .to with another dtype")
+            guard.refuse("copies to the host (.type with a CPU type); .to(dtype), as in .to(torch.int64), does not")
         elif func is Tensor.new_tensor:
             return self._constant(func, args[1], args, kwargs, (args[0].dtype, args[0].device))
         elif func in _device_constructors() or func is torch.normal:
@@ -375,7 +375,7 @@ class _Calls(TorchFunctionMode):
         return any(isinstance(value, kinds) and torch.device(value).type == "cpu" for value in values)
 
     def _factory(self, func: Any, args: Any, kwargs: Any) -> Any:
-        """Call a function that makes a tensor from nothing or from host data, unless a graph can't hold it."""
+        """Call `func`, which makes a tensor from nothing or from host data. Refuse a call that a graph can't hold."""
         given = [*args, *kwargs.values()]
         of_tensor = bool(given) and isinstance(given[0], Tensor) and (func in self.OF_DATA or func is torch.normal)
         device = kwargs.get("device") or default_device()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 LIBRARIES = ("builtins", "legged", "mujoco", "newton", "numpy", "tensordict", "torch", "warp")
-"""Packages whose objects hold no state of the user."""
+"""Packages whose objects hold no state of a user's code."""
 
 
 def random_states() -> dict[str, Any]:
@@ -21,7 +21,7 @@ def plain_state(value: Any, depth: int = 3) -> Any:
     """Return a comparable form of a Python value.
 
     The value may be a number, a text, an array, a random generator, an object of a user's class, or a container of these.
-    Tensors and the parts of a task are left out. For these, the guard compares the operators that read them.
+    Other values, such as tensors, give None. For tensors, the guard compares the operators that read them.
     """
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return repr(value)

@@ -1,4 +1,4 @@
-"""The control step as one CUDA graph, with the guard that keeps the step capturable on machines without a GPU."""
+"""The control step as one CUDA graph, with a guard that checks, on any machine, that the step can be captured."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ __all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGra
 
 
 class Branch:
-    """Work in parallel to the rest of the step: a second stream on a GPU, and a parallel branch of the captured graph.
+    """Part of the step that runs in parallel to the rest: a second stream on a GPU, and a branch of the captured graph.
 
     The step's small kernels are bound by latency, so kernels in a parallel branch cost nothing. Tensors that both streams use
     must be allocated before `fork`, because one stream may reuse memory that the other still reads. Call `join` before the
@@ -43,7 +43,7 @@ class Branch:
 def garbage_kept() -> Iterator[None]:
     """Switch off garbage collection in the block.
 
-    A reference cycle may hold the CUDA graph of an earlier task. CUDA forbids freeing a graph during a capture, and the
+    A reference cycle may hold the CUDA graph of an earlier task. If garbage collection freed this graph during a capture, the
     capture would fail.
     """
     collects = gc.isenabled()
@@ -72,7 +72,7 @@ class StepGraph:
         warm_up_steps: int = WARM_UP_STEPS,
         rehearse: Callable[[], None] | None = None,
     ) -> None:
-        """Check or capture `function`. With `enabled` false it runs eagerly and unchecked. If `function` repeats the same
+        """Check or capture `function`. With `enabled` false the function runs eagerly and unchecked. If it repeats the same
         work many times, `rehearse` does that work once; warm-up and check call `rehearse` instead.
 
         Raises:
@@ -81,7 +81,7 @@ class StepGraph:
         """
         self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
-        # A function that repeats the same work needs one check. For a single step, several runs are compared.
+        # One check is enough if the function repeats the same work. Otherwise several runs of it are compared.
         self._checks = ForbidHostReads.STEPS if rehearse is None else 1
         self._guard = ForbidHostReads(device, getattr(function, "__self__", None))
         if not enabled:
@@ -96,10 +96,10 @@ class StepGraph:
             raise
 
     def _check(self) -> None:
-        """Run the step under the guard. Its errors name their cause, unlike the error of a failed capture."""
+        """Run the step under the guard. The guard's errors name their cause, unlike the error of a failed capture."""
         for step in range(self._checks):
-            # The first step uses up random numbers, as any rehearsal does. The steps compared with it leave the host's
-            # generator unchanged.
+            # The first run advances the host's random generator, as any rehearsal does. The other runs only serve the
+            # comparison, so the generator is restored after them.
             with torch.random.fork_rng(devices=[], enabled=step > 0), self._guard:
                 self._rehearse()
 
@@ -109,7 +109,7 @@ class StepGraph:
         wp.init()  # a step without Warp kernels has not initialised Warp yet
         stream = torch.cuda.Stream(device)
         stream.wait_stream(torch.cuda.current_stream(device))
-        # Warp looks up a device and a stream when they are first used. During a capture these calls would fail.
+        # Warp looks up a device and a stream when they are first used. During a capture these look-ups would fail.
         with wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
             wp.zeros(1, dtype=float, device=wp.device_from_torch(device))
         with torch.cuda.stream(stream):
@@ -119,7 +119,7 @@ class StepGraph:
         torch.cuda.current_stream(device).wait_stream(stream)
         torch.cuda.synchronize(device)
         graph = torch.cuda.CUDAGraph()
-        # With several processes, each has a thread for collective operations that may call CUDA during the capture.
+        # With several processes, torch's thread for collective operations may call CUDA during the capture.
         error_mode = "thread_local" if torch.distributed.is_initialized() else "global"
         failure: Exception | None = None
         try:
@@ -134,7 +134,7 @@ class StepGraph:
                         failure = error
                         raise
         except Exception as error:
-            failure = failure or error  # the end of a broken capture fails too; that error would hide the cause
+            failure = failure or error  # ending a broken capture raises another error, which hides the cause
         if failure is not None:
             raise failure
         return graph

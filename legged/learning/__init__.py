@@ -1,3 +1,3 @@
-"""rsl-rl's PPO and distillation, in rsl-rl's training loop or one that keeps the host out; runs, checkpoints and their
-display.
+"""Training with rsl-rl's PPO or distillation, in rsl-rl's own loop or in one without host reads. Also run folders,
+checkpoints and the console display.
 """

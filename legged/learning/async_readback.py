@@ -7,13 +7,13 @@ from torch import Tensor
 
 
 class AsyncReadback:
-    """Values of some tensors at the moment of the call, copied to the host in one transfer. Work launched later does not
-    change them.
+    """Snapshot of some tensors, copied to the host in one transfer. Work that is launched after the constructor does not
+    change it.
     """
 
     @torch.no_grad()
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
-        """Start the transfer of `tensors`, by name. On a GPU this returns at once."""
+        """Start the transfer of `tensors` (name -> tensor). On a GPU this returns at once."""
         self._sizes = {name: tensor.numel() for name, tensor in tensors.items()}
         self._numbers = torch.cat([tensor.reshape(-1) for tensor in tensors.values()])  # a copy: the tensors may change
         self._arrival: torch.cuda.Event | None = None
@@ -25,7 +25,7 @@ class AsyncReadback:
             self._arrival.record()
 
     def numbers(self) -> dict[str, list[float]]:
-        """Wait for the transfer and return the values of each tensor."""
+        """Wait for the transfer and return name -> values of the tensor, flattened."""
         if self._arrival is not None:
             self._arrival.synchronize()
         pieces = self._numbers.split(list(self._sizes.values()))

@@ -39,9 +39,9 @@ LOGGED = "log/"
 class CapturedRunner(Runner):
     """Runner whose loop only launches work on the device, and reads the logged numbers once per iteration.
 
-    On a GPU it launches the next iteration before it logs the last one, so the device never waits for the log. Checkpoints,
-    configuration and logs are those of Runner. If a feature needs rsl-rl's own loop, `why_stock` names the feature and
-    `learn` runs that loop.
+    On a GPU the loop launches the next iteration before it logs the previous one, so the device never waits for the log.
+    Checkpoints, configuration and logs are those of Runner. If a feature needs rsl-rl's own loop, `why_stock` names the
+    feature and `learn` runs that loop.
     """
 
     alg: DevicePPO
@@ -63,7 +63,7 @@ class CapturedRunner(Runner):
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations."""
         if self.why_stock:
-            print(f"rsl-rl's own training loop: {self.why_stock}", flush=True)
+            print(f"this run uses rsl-rl's own training loop: {self.why_stock}", flush=True)
             super().learn(num_learning_iterations, init_at_random_ep_len)
             return
         self.alg.train_mode()
@@ -106,15 +106,15 @@ class CapturedRunner(Runner):
             if saves:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
             if saves or evaluates:
-                clock = None  # a new clock, so that saving and evaluation don't count
+                clock = None  # a new clock leaves out the time of saving and evaluation
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
     @property
     def _runs_ahead(self) -> bool:
-        """True if the next iteration is launched before the last one is logged. With several processes it is False, because
-        all of them must agree before training stops.
+        """True if the next iteration is launched before the previous one is logged. With several processes it is False,
+        because all of them must agree before training stops.
         """
         return torch.device(self.device).type == "cuda" and not self.is_distributed
 
@@ -125,8 +125,8 @@ class CapturedRunner(Runner):
     def _capture(self, rollout: Steps, warms_up: bool) -> tuple[Callable[[], None], Callable[[], None], Callable[[], None]]:
         """Return three functions: the rollout, the update, and the update of the value function alone.
 
-        They replay CUDA graphs if the task's step does. The third function differs from the second only if training begins
-        with updates of the value function (`warms_up`). Afterwards networks and task are in the state that they had before.
+        They replay CUDA graphs if the task's step is captured. The third differs from the second only if training begins with
+        updates of the value function (`warms_up`). Afterwards the networks have their earlier weights, and the task is reset.
         """
         device = torch.device(self.device)
         enabled = self.env.captured
@@ -145,7 +145,7 @@ class CapturedRunner(Runner):
             known = {id(tensor) for tensor, _ in before}
             for state in self.alg.optimizer.state.values():
                 for tensor in state.values():
-                    if id(tensor) not in known:  # the trial steps created this tensor
+                    if id(tensor) not in known:  # this tensor did not exist before the trial steps
                         tensor.zero_()
         if enabled:
             rollout.forget()
@@ -164,8 +164,8 @@ class CapturedRunner(Runner):
         return AsyncReadback({"ended": rollout.ended, **self.alg.outcome(), **named})
 
     def _log_before(self, launched: "LaunchedIteration", following: "LaunchedIteration") -> None:
-        """Log an iteration while the device computes the `following` one. If training ends here, log the `following` one too,
-        because the networks have learned from it.
+        """Log the iteration `launched` while the device computes `following`. If training was asked to stop, log `following`
+        too, because the networks have learned from it.
 
         Raises:
             Interrupted: the training was asked to stop.
@@ -213,8 +213,8 @@ class CapturedRunner(Runner):
 def copies(tensors: Iterable[Tensor]) -> list[Tensor]:
     """Copy tensors outside autograd.
 
-    If autograd recorded a copy, the node that accumulates the parameter's gradient would stay bound to the stream of the
-    copy. A later capture on another stream would have to wait for that stream, and CUDA forbids this.
+    If autograd recorded the copy of a parameter, the node that accumulates this parameter's gradient would stay bound to the
+    stream of the copy. A later capture on another stream would have to wait for that stream, and CUDA forbids this.
     """
     return [tensor.clone() for tensor in tensors]
 
@@ -255,7 +255,7 @@ class LaunchedIteration:
     first: int
     """First iteration of this training."""
     total: int
-    """Iterations of the whole training, including those of the run that this one resumes."""
+    """Number of iterations of the whole training, including those before it was resumed."""
     readback: AsyncReadback
     clock: Clock
     """Clock with the times of the rollout and of the update."""

@@ -23,7 +23,7 @@ from legged.process.paths import relative, write_bytes
 from legged.robots.robot import load_robot
 
 FORMAT = 2
-"""Version of `infos`. Files without a version (rsl-rl's, and old ones of this package) count as 1."""
+"""Version of `infos`. Files that name no version (rsl-rl's, and old ones of this package) have version 1."""
 Saved = dict[str, Any]
 
 
@@ -39,7 +39,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
     it runs.
 
     Raises:
-        ConfigError: the file can't be read, is not a torch file, or holds anything else.
+        ConfigError: the file can't be read, is not a torch file, or holds other than plain data.
     """
     name = relative(path)
     try:
@@ -50,7 +50,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
         return torch.load(path, weights_only=True, map_location=device)
     except pickle.UnpicklingError as error:
         if "weights_only" in str(error):
-            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data, which could run code)") from error
+            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data; that could run code)") from error
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
     except Exception as error:  # torch raises half a dozen types of errors for a foreign file
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
@@ -62,7 +62,7 @@ def _first_line(error: Exception) -> str:
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
-    """Return the content of a checkpoint, with the types of its entries checked and all weights finite.
+    """Return the content of a checkpoint. Check the types of its entries, and that all weights are finite.
 
     Raises:
         ConfigError: the file is missing, is not a checkpoint, has a newer format, or is damaged.
@@ -70,7 +70,7 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     saved = load_plain(path, device)
     name = relative(path)
     if not isinstance(saved, dict) or not {"actor_state_dict", "iter"} <= saved.keys():
-        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (no actor and iteration in it)")
+        raise ConfigError(f"{name}: not a checkpoint of rsl-rl (it lacks actor_state_dict or iter)")
     infos = {} if saved.get("infos") is None else saved["infos"]
     _check_kind(f"{name}: not a checkpoint: its", saved, PARTS)
     _check_kind(f"{name}: not a checkpoint: its infos.", infos, INFOS)
@@ -85,7 +85,7 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
 
 
 def networks_in(saved: Mapping[str, Any]) -> list[str]:
-    """Return the names of the networks in a checkpoint: actor and critic, or the actor alone, which is enough to act."""
+    """Return the names of the networks in a checkpoint: actor and critic, or the actor alone."""
     return [network for network in NETWORKS if f"{network}_state_dict" in saved]
 
 
@@ -113,12 +113,12 @@ INFOS: dict[str, Kind] = {
     "wall_s": float,
     "evaluation": {str: float},
 }
-"""Entry -> its type: one type, several types, or {type: type of each value}."""
+"""Entry -> allowed type: one type, a tuple of types, or {type of the keys: type of the values}."""
 
 
 def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
-    """Raise ConfigError if an entry of `found` has the wrong type. A missing entry passes; the code that reads the entry
-    checks for it.
+    """Raise ConfigError if an entry of `found` has the wrong type. Missing entries are allowed here; the code that reads an
+    entry checks for it.
     """
     for key, kind in kinds.items():
         if key not in found:
@@ -132,7 +132,7 @@ def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind])
 
 
 def is_kind(value: Any, kind: Kind) -> bool:
-    """Return True if a value has the type `kind`. Numbers must be finite, and lists may hold plain values only."""
+    """Return True if a value has the type `kind`. Numbers must be finite. Lists may hold plain values and dictionaries."""
     if isinstance(kind, dict):
         ((of_keys, of_values),) = kind.items()
         return isinstance(value, dict) and all(is_kind(k, of_keys) and is_kind(v, of_values) for k, v in value.items())
@@ -156,8 +156,8 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
-    """Return an optimiser's state from a checkpoint, with checked moments. The settings other than the learning rate are
-    those of `optimizer`. The first `waiting` parameters may all lack moments, but not only some of them.
+    """Check an optimiser's state `saved` and return it. Settings other than the learning rate come from `optimizer`. If only
+    some parameters have moments, that is an error, unless exactly the first `waiting` parameters lack them.
 
     Raises:
         ConfigError: the state does not fit these parameters; the text begins with `where`.
@@ -182,7 +182,7 @@ def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, wait
 
 
 def describe(task: BaseTask) -> dict[str, Any]:
-    """Return the constant part of a checkpoint's `infos`: the task, robot, observations and networks that it fits."""
+    """Return the constant entries of a checkpoint's `infos`, such as task, robot, observations and networks."""
     robot = getattr(task, "robot", None)
     return {
         "format": FORMAT,
@@ -204,7 +204,7 @@ def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
 
 
 def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
-    """Return, for each network, the settings of `train.policy` that decide its weights and its outputs."""
+    """Return network -> setting -> value for the settings of `train.policy` that decide its weights and outputs."""
     policy = cfg.train.policy
     recurrent = policy.rnn_type != "none"
     shared = {
@@ -223,14 +223,14 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     described = {}
     for name in NETWORKS:
         read = groups_of(cfg, name)
-        own = {"observations": list(read), "history": groups[read[0]].history}  # old versions read these
+        own = {"observations": list(read), "history": groups[read[0]].history}  # old versions read these entries
         hidden = list(getattr(policy, f"{name}_hidden_dims"))
         described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Return those settings of `networks` that the weights in `state` show, for a checkpoint that does not store them."""
+    """Return the settings of one network that can be derived from its weights `state`. Old checkpoints store no settings."""
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")
@@ -253,8 +253,8 @@ def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
 
 
 def histories(saved: Saved) -> dict[str, int]:
-    """Return the history [steps] of each observation group of a checkpoint, where it is known. In old files each network
-    reads the group that has the network's name.
+    """Return observation group -> history [steps], as far as a checkpoint tells it. In old files each network reads the group
+    that has the network's name.
     """
     infos = saved["infos"]
     old = {name: said["history"] for name, said in infos.get("networks", {}).items() if "history" in said}
@@ -275,7 +275,7 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
         for group, wanted in ((group, cfg.observations.groups[group]) for group in groups_of(cfg, network)):
             if group in layout and tuple(layout[group]) != wanted.terms:
                 known = {term: width for widths in layout.values() for term, width in widths.items()}
-                size = sum(known[term] for term in wanted.terms) if set(wanted.terms) <= set(known) else "other"
+                size = sum(known[term] for term in wanted.terms) if set(wanted.terms) <= set(known) else "others"
                 raise ConfigError(
                     f"{name}: made for other observations: its {group} takes {sum(layout[group].values())} numbers"
                     f" ({', '.join(layout[group])}), '{cfg.task}' gives {size} ({', '.join(wanted.terms)})"
@@ -287,25 +287,25 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> None:
-    """Compare the robot that a checkpoint was made for (`name` and `joints`) with the robot of a configuration.
+    """Compare the robot of a checkpoint (`name` and `joints` in `made_for`) with the robot of a configuration.
 
     Raises:
-        ConfigError: the robot has other joints, or the same in another order.
+        ConfigError: the joints of the two robots differ in name or order.
     """
     joints = made_for.get("joints")
     if joints is None or not isinstance(cfg, LeggedConfig):
         return
     robot = load_robot(cfg.robot, cfg.origins.where("robot"))
     if list(robot.joint_names) != joints:
-        theirs = f"'{made_for.get('name')}' with {len(joints)} joints"
-        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}: {joints}")
+        theirs = f"'{made_for.get('name')}' with {len(joints)} joints {joints}"
+        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}")
 
 
 def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
     """Compare the networks of a checkpoint with those of a configuration.
 
     Raises:
-        ConfigError: the networks have other weights, compute something else, or read other groups.
+        ConfigError: a network's layers, its other settings or its observation groups differ.
     """
     described = described_networks(saved)
     for network in described:
@@ -332,11 +332,11 @@ def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def describe_mismatch(path: Path, saved: Saved, wanted: dict[str, Any], task: str) -> str:
-    """Return the first difference between a checkpoint's policy and the one that the built task needs."""
+    """Return an error text: the first difference in shape between a checkpoint's policy and the state `wanted`."""
     found = saved["actor_state_dict"]
     text = f"{relative(path)}: made for another task than '{task}'"
     for name in dict.fromkeys([*wanted, *found]):
         here, there = (tuple(state[name].shape) if name in state else None for state in (wanted, found))
         if here != there:
-            return f"{text}: its policy's {name} has the shape {there}, the task's {here}"
+            return f"{text}: its policy's {name} has the shape {there}, the task's policy has {here}"
     return f"{text}: its critic or its optimiser has other shapes"

@@ -16,7 +16,7 @@ class CriticWarmup(ScaledRewards):
     """Number of coming updates that change the value function alone."""
 
     def warming_up(self) -> bool:
-        """Return True if the update that begins is a warm-up update, and count it."""
+        """Return True if the next update is a warm-up update. Then reduce `warmup_left` by 1."""
         warming = self.warmup_left > 0
         self.warmup_left -= warming
         return warming
@@ -30,7 +30,7 @@ class CriticWarmup(ScaledRewards):
 
     @contextmanager
     def _policy_kept(self) -> Iterator[None]:
-        """Freeze the policy during rsl-rl's update in the block, so that the update changes the value function alone."""
+        """Freeze the policy in the block, so that rsl-rl's update changes the value function alone."""
         actor, schedule = self._raw_actor, self.schedule
         learned = [parameter for parameter in actor.parameters() if parameter.requires_grad]
         normalized, actor.obs_normalization = actor.obs_normalization, False  # so the update keeps the normaliser

@@ -45,7 +45,7 @@ WARNINGS = {
     "non_finite_worlds": "{:.0f} robots reset for NaN or infinite numbers (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
 }
-"""Metrics of faults, shown if they are above 0."""
+"""Metric of a fault -> warning, shown if the metric is above 0."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Progress:
     """Mean return of the last 100 episodes."""
     action_std: float
     values: dict[str, float]
-    """Log of the task: `rew_<term>` per second of a full episode, `Metrics/...` and other sections; NaN for an entry without
-    a value so far."""
+    """Log entries of the task: rewards `rew_<term>` (per second of a full episode), `Metrics/...` and other sections. An
+    entry without a value so far is NaN."""
     behavior: float | None = None
-    """Mean loss between a student's actions and its teacher's; None without a teacher."""
+    """Mean loss between the actions of a student and of its teacher; None without a teacher."""
 
     def metrics(self) -> dict[str, float]:
         """Return the task's metrics by name, those of `STYLES` first."""
@@ -76,7 +76,7 @@ class Progress:
         return {**first, **{name: value for name, value in found.items() if name not in (*STYLES, *WARNINGS)}}
 
     def others(self) -> dict[str, float]:
-        """Return the log entries that the display has no fixed place for, as 'section: name'."""
+        """Return 'section: name' -> value for the log entries that have no fixed place on the display."""
         found = {}
         for key, value in self.values.items():
             section, _, name = key.partition("/")
@@ -85,7 +85,7 @@ class Progress:
         return found
 
     def line(self) -> str:
-        """Return the iteration on one line."""
+        """Return the iteration as one line of text."""
         shown = "".join(self._word(name, value) for name, value in [*self.metrics().items()][:ON_THE_LINE])
         loss = "" if self.behavior is None else f"  behaviour loss {self.behavior:.4f}"
         return (
@@ -95,33 +95,33 @@ class Progress:
         )
 
     def _word(self, name: str, value: float) -> str:
-        """Return the text of a metric on the line, with the space before it."""
+        """Return a metric as text for the plain line, beginning with a space."""
         style = STYLES.get(name)
         if style is None:
             return f"  {plain(name)} {number(value):>8}"
         return (f"  {style.word} " if style.word else " ") + styled(value, style)
 
     def _reward(self) -> str:
-        """Return the mean return, or a dash before the first episode has ended."""
+        """Return the mean return as text; a dash before the first episode has ended."""
         return "-" if isnan(self.reward) else f"{self.reward:.2f}"
 
     def level(self) -> str:
-        """Return the mean terrain level, if there is one."""
+        """Return the mean terrain level as text; empty if the task logs none."""
         level = self.values.get("Terrain/level", nan)
         return "" if isnan(level) else f"  level {level:.2f}"
 
     def evaluated(self) -> str:
-        """Return the first figure of the last evaluation during training, if there was one."""
+        """Return the first figure of the last evaluation as text; empty before the first evaluation."""
         found = [(key, value) for key, value in self.values.items() if key.startswith(SECTION)]
         return "".join(f"  evaluated {plain(key.removeprefix(SECTION))} {value:.3f}" for key, value in found[:1])
 
     def estimated(self) -> str:
-        """Return the errors of an estimator, if there is one."""
+        """Return the errors of the estimates as text; empty without an estimator."""
         found = [(key.removeprefix(ESTIMATES), value) for key, value in self.values.items() if key.startswith(ESTIMATES)]
         return "".join(f"  estimated {plain(name)} {value:.3f}" for name, value in found)
 
     def levels(self) -> dict[str, str]:
-        """Return, for each terrain type, its mean level and the shares of episodes that moved up and down."""
+        """Return terrain type -> text with its mean level and the shares of episodes that moved up and down."""
         found = {}
         for key, level in self.values.items():
             name = key.removeprefix("Terrain/level_")

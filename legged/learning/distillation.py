@@ -20,15 +20,15 @@ from legged.learning.recurrent import Memory
 class DeviceDistillation(Distillation):
     """DAgger (Ross et al., arXiv 1011.0686) as rsl-rl computes it, for students with and without recurrent layers.
 
-    The differences from rsl-rl are these. Losses are summed on the device and read once per iteration. A student without
-    recurrent layers learns from all steps of a gradient in one batch. The optimiser is fused. A recurrent teacher keeps its
+    The differences from rsl-rl are these. Losses are summed on the device and read once per iteration. Without recurrent
+    layers, the `gradient_length` steps of one gradient form one batch. The optimiser is fused. A recurrent teacher keeps its
     hidden state from one iteration to the next, while rsl-rl resets it. With `stock`, rsl-rl's own update and loop run.
     """
 
     def __init__(self, student: MLPModel, teacher: MLPModel, *args: Any, stock: bool = False, **kwargs: Any) -> None:
         for parameter in student.distribution.parameters():  # no loss depends on the noise of the student's actions
             parameter.requires_grad_(False)
-        with warnings.catch_warnings():  # rsl-rl warns of left-over steps, which the configuration forbids
+        with warnings.catch_warnings():  # no warning of gradient_length: the configuration has checked it
             warnings.simplefilter("ignore")
             super().__init__(student, teacher, *args, **kwargs)
         name = kwargs.get("optimizer", "adam")
@@ -55,13 +55,13 @@ class DeviceDistillation(Distillation):
 
     @property
     def actor(self) -> MLPModel:
-        """Policy that acts, which is the student."""
+        """Policy that acts: the student."""
         return self._raw_student
 
     @property
     def fits_graph(self) -> bool:
-        """True if an update can be captured. An update of recurrent layers can't be, because the GPU's library chooses which
-        kernels it launches for them.
+        """True if an update can be captured. With recurrent layers it can't, because the GPU's library decides which kernels
+        it launches.
         """
         return not self.student.is_recurrent
 
@@ -83,7 +83,7 @@ class DeviceDistillation(Distillation):
         return self.losses()
 
     def learn(self, epochs: int | None = None) -> None:
-        """Learn for all epochs, or for `epochs` of them, from the stored rollout, without a host read."""
+        """Learn from the stored rollout for `epochs` epochs, by default all configured ones, without a host read."""
         self._losses.zero_()
         epochs = epochs or self.num_learning_epochs
         observations = self.storage.observations
@@ -96,14 +96,14 @@ class DeviceDistillation(Distillation):
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
     def outcome(self) -> dict[str, Tensor]:
-        """Return the results of an update, on the device: `losses` (2,), and the standard deviation `std` (D,) of the
-        actions.
+        """Return the results of an update, on the device: `losses` (2,), which the method `losses` takes once they are on the
+        host, and the standard deviation `std` (D,) of the actions.
         """
         return {"losses": self._losses, "std": self.action_std()}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean loss of a step, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`. If
-        `numbers` is None, the results of the last update are read from the device. The loss is NaN if no gradient was used.
+        """Return the mean loss of a step, and set `left_out`. `numbers` are the `losses` of `outcome`, read on the host; if
+        None, the last update's results are read from the device. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
@@ -133,7 +133,7 @@ class DeviceDistillation(Distillation):
         self.memory.take(memory.parts)
 
     def _descend(self, loss: Tensor) -> None:
-        """Take a gradient step on the `loss` () of `gradient_length` steps. Skip it if a gradient is NaN or infinite."""
+        """Take a gradient step on `loss` (), the sum over `gradient_length` steps, unless a gradient is NaN or infinite."""
         mean = loss.detach() / self.gradient_length
         if self.is_multi_gpu:
             self._shared.zero_()
@@ -149,8 +149,8 @@ class DeviceDistillation(Distillation):
         self._losses += torch.where(fine, torch.stack([mean, torch.ones_like(mean)]), 0.0)
 
     def save(self) -> dict:
-        """Return the parts of a checkpoint: the student as `actor`, the teacher, and the optimiser in rsl-rl's form, which is
-        not fused and counts its steps on the host.
+        """Return the parts of a checkpoint: the student as `actor`, the teacher, and the optimiser. The optimiser has
+        rsl-rl's form: it is not fused, and its step counts are on the host.
         """
         saved = self.optimizer.state_dict()
         state = {

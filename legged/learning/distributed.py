@@ -15,10 +15,10 @@ class RankLost(Exception):
 
 
 def check_reachable(ranks: Ranks) -> None:
-    """Check that the environment gives the address at which the processes meet, if there are several.
+    """Check that environment variables give the address at which processes meet, if there are several processes.
 
     Raises:
-        ConfigError: the address is missing. WORLD_SIZE may be left over from another program.
+        ConfigError: the address is missing, although WORLD_SIZE says that there are several processes.
     """
     missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
     if ranks.several and missing:
@@ -41,7 +41,7 @@ def join(ranks: Ranks, device: torch.device) -> None:
 
 
 def leave() -> None:
-    """Wait until all processes are done, so that no process ends while another still saves."""
+    """Wait for all processes, so that no process ends while another still saves. Then leave the process group."""
     if dist.is_initialized():
         dist.barrier()
         dist.destroy_process_group()

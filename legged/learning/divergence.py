@@ -1,5 +1,5 @@
-"""Detector for trainings whose numbers become NaN or infinite. It warns once of each fault, and ends a training that does not
-recover.
+"""Detector of trainings whose numbers become NaN or infinite. It warns once of each fault, and gives a reason to end a
+training that does not recover.
 """
 
 import sys
@@ -23,8 +23,8 @@ class Diverged(RunError):
 
 
 class DivergenceDetector:
-    """Detector that reads the log of each iteration. It warns once of every fault, and decides when a training can't
-    recover.
+    """Detector that reads the log of each iteration. It warns once of each fault, and sets `why_stop` if the training does
+    not recover.
     """
 
     def __init__(self, steps_per_iteration: int) -> None:
@@ -57,12 +57,12 @@ class DivergenceDetector:
             self.why_stop = f"numbers were NaN or infinite for {PATIENCE} iterations in a row{culprits}: {' and '.join(what)}"
 
 
-MEANING = {"physics": "left all bounds, and they were reset", "action": "was NaN, and they were reset"}
+MEANING = {"physics": "went out of bounds, so they were reset", "action": "was NaN, so they were reset"}
 """Fault -> description, for the faults that are not simply a NaN or infinite term."""
 
 
 def term(name: str) -> str:
-    """Return the method name of a term, 'reward_torques' -> '_reward_torques', or 'the physics', 'the action'."""
+    """Return the name of a fault as text: '_reward_torques' for the term 'reward_torques', or 'the physics'."""
     return f"the {name}" if name in MEANING else f"_{name}"
 
 

@@ -17,14 +17,14 @@ from torch import Tensor, nn
 from legged.mdp.observations import ObservationGroup
 
 TARGETS = "estimator"
-"""Name of the set of observations, in rsl-rl's sense, that holds the estimator's targets."""
+"""Key in rsl-rl's `obs_groups` for the observation groups that hold the estimator's targets."""
 SECTION = "Estimator/"
 """Prefix of the estimates' errors in TensorBoard."""
 
 
 class EstimatingModel(MLPModel):
-    """MLP policy with an estimator, a second MLP that reads the same normalised observations (width I). The policy reads
-    these observations, then the estimator's E estimates and L free outputs.
+    """MLP policy with an estimator, which is a second MLP. Both read the normalised observations (width I). The policy also
+    reads the estimator's outputs: E estimates and L values without a target (`latent`).
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class EstimatingModel(MLPModel):
 
 
 class EstimatingLayers(nn.Module):
-    """Copy of the layers of an EstimatingModel that follow the normaliser, for export."""
+    """Copy, for export, of all layers of an EstimatingModel after its normaliser."""
 
     def __init__(self, model: EstimatingModel) -> None:
         """Copy the layers of `model`."""
@@ -113,14 +113,14 @@ class EstimationErrors:
         self.names: tuple[str, ...] = tuple(term.name for term in group.terms)
         """Names of the estimated terms."""
         scale = torch.cat([term.scale for term in group.terms])
-        # A target with the scale 0 is always 0. Its error is 0, and has no unit.
+        # A target with the scale 0 is always 0, so its error can't be given in a unit, and counts as 0.
         self._factors = torch.where(scale == 0.0, torch.zeros_like(scale), scale.reciprocal()).square()
         self._shares = torch.zeros(len(scale), len(self.names), device=scale.device)
         for i, term in enumerate(group.terms):
             self._shares[term.columns, i] = 1.0 / (term.columns.stop - term.columns.start)
 
     def squares(self, estimates: Tensor, targets: Tensor) -> Tensor:
-        """Return the mean square error (n, terms) of each sample and term. `estimates` and `targets` (n, E) are both
-        scaled.
+        """Return the mean square error (n, terms) of each sample and term. `estimates` and `targets` (n, E) both have the
+        terms' scales.
         """
         return ((estimates - targets).square() * self._factors) @ self._shares

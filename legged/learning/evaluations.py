@@ -17,7 +17,7 @@ from legged.learning.run_folder import BEST_MODEL
 from legged.process.paths import write_bytes
 
 SECTION = "Evaluation/"
-"""Prefix of the figures in TensorBoard."""
+"""Prefix of the evaluations' figures in TensorBoard."""
 
 
 class Measurement(Protocol):
@@ -36,12 +36,12 @@ class Evaluated:
     """Result of one evaluation."""
 
     iterations: int
-    """Iterations for which the policy had been trained."""
+    """Number of iterations for which the policy had been trained."""
     figures: Mapping[str, float]
     loop_s: float
     """Time that this process had spent in iterations [s]."""
     steps: int
-    """Control steps of all robots that this process had made."""
+    """Control steps of all robots since this process began."""
 
 
 class Ended(Exception):
@@ -59,7 +59,7 @@ class Evaluations:
         self.best_by = self._runner.best_by or measurement.figures[0]
         """Figure that decides which policy is the best."""
         self.best: float | None = None
-        """Best value of that figure so far."""
+        """Best value of the figure `best_by` so far."""
         self.history: list[Evaluated] = []
         """Results of all evaluations, in order."""
         self.spent_s = 0.0
@@ -74,14 +74,14 @@ class Evaluations:
         """Function that receives every result and returns a reason to end the training, or an empty text."""
 
     def may_be_due(self, iterations: int, total: int) -> bool:
-        """Return True if an evaluation may be due after `iterations` of `total`: at every interval, and at the end."""
+        """Return True if an evaluation may be due after `iterations`: at every `evaluate_interval`, and at `total`."""
         return iterations == total or iterations % self._runner.evaluate_interval == 0
 
     def due(self, iterations: int, total: int, loop_s: float) -> bool:
-        """Return True if an evaluation is due after `iterations` of `total`, which took `loop_s` [s].
+        """Return True if an evaluation is due after `iterations` of `total` iterations. So far they have taken `loop_s` [s].
 
-        One is due at the end, and at every interval at which `evaluate_share` leaves time for two evaluations: this one and
-        the one at the end.
+        An evaluation is due at the end. At an interval it is due if it is the first, or if `evaluate_share` leaves time for
+        two evaluations: this one and the one at the end.
         """
         if iterations == total:
             return True
@@ -91,8 +91,8 @@ class Evaluations:
         return share >= 1.0 or not self.history or self.spent_s + 2.0 * self._last_s <= share * loop_s
 
     def evaluate(self, policy: nn.Module, iterations: int, loop_s: float, steps: int) -> bool:
-        """Measure a policy that was trained for `iterations`, `loop_s` seconds and `steps`. Return True if it is the best so
-        far. Afterwards `why_end` tells if training should end.
+        """Measure a policy after `iterations` of training, which took `loop_s` [s] and `steps` control steps. Return True if
+        it is the best policy so far. Also set `why_end` if training should end.
         """
         start = self._clock()
         found = Evaluated(iterations, self._measurement.measure(policy), loop_s, steps)
@@ -107,7 +107,7 @@ class Evaluations:
         return improved
 
     def _judge(self, found: Evaluated) -> None:
-        """Decide if training should end."""
+        """Set `why_end` if the target is reached, or if the listener gives a reason."""
         target = self._runner.stop_at
         if target and all(reaches(name, found.figures[name], value) for name, value in target.items()):
             self.reached = True
@@ -130,13 +130,13 @@ class Evaluations:
         return lines
 
     def go_on_from(self, checkpoint: Path) -> None:
-        """Take over the best policy of the run that is resumed, unless it is newer than the `checkpoint` or was chosen by
+        """Take over the best policy of the resumed run, unless this policy is newer than `checkpoint` or was chosen by
         another figure.
         """
         path = checkpoint.with_name(BEST_MODEL)
         try:
             best, iteration = read_checkpoint(path), read_checkpoint(checkpoint)["iter"]
-        except ConfigError:  # there is no best policy
+        except ConfigError:  # the run has no best policy that can be read
             return
         value = best["infos"].get("evaluation", {}).get(self.best_by)
         if value is not None and best["iter"] <= iteration:

@@ -6,8 +6,8 @@ import torch
 
 
 class GradientGuard:
-    """Hook that skips the steps of an optimiser in which a gradient is NaN or infinite. It reads from the device at every
-    step.
+    """Hook that skips each step of an optimiser in which a gradient is NaN or infinite. At every step it reads a number from
+    the device.
     """
 
     def __init__(self, optimizer: torch.optim.Optimizer) -> None:

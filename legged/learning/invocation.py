@@ -1,7 +1,7 @@
-"""The task and settings on a training's command line, stored in its run folder as given.json.
+"""Task and settings from the command line of a training, stored in the run folder as given.json.
 
-The name of a user-defined task is not enough to find it: its module or file must be known too. A report therefore names the
-task as the command line did. If the report can't load the task, it shows the settings of the command line.
+The name of a user-defined task is not enough to find the task: the module or file that defines it must be known. So a report
+names that file in its commands. If a report can't load the task, it shows the settings of the command line.
 """
 
 import json
@@ -28,11 +28,11 @@ class Invocation:
     module: str | None = None
     """Value of --import."""
     changes: Mapping[str, Any] = field(default_factory=dict)
-    """Dotted path -> value; for a resumed training, with those of earlier command lines."""
+    """Dotted path -> value. A resumed training also has the settings of earlier command lines."""
 
     @property
     def flags(self) -> list[str]:
-        """Options by which another command finds a user-defined task."""
+        """Options that another command needs to find a user-defined task."""
         files = [file for file in (self.module, self.task) if file and (file == self.module or file.endswith(YAML_ENDINGS))]
         return ["--import", ",".join(files)] if files else []
 
@@ -45,7 +45,7 @@ def write_invocation(folder: Path, invocation: Invocation, before: Path | None =
     """
     earlier: Mapping[str, Any] = {}
     if before is not None:
-        with suppress(ConfigError):  # a report on that run will name the damage
+        with suppress(ConfigError):  # skip a damaged file; a report on that run names it
             earlier = (read_invocation(before) or invocation).changes
     said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
     write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")

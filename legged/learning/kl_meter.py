@@ -22,7 +22,7 @@ class KLMeter:
 
     @torch.inference_mode()
     def flush(self) -> float | None:
-        """Return the mean divergence of the calls since the last flush. Return None if there were none, as with a fixed
+        """Return the mean divergence since the last flush, or None if rsl-rl has computed no divergence, as with a fixed
         learning rate.
         """
         means, self._means = self._means, []

@@ -42,23 +42,22 @@ class QuietLogger(Logger):
         self.divergence = DivergenceDetector(self.cfg["num_steps_per_env"] * self.num_envs)
         self.stop_requested = False
         self.evaluate: Callable[[int, int], dict[str, float]] = lambda _iterations, _total: {}
-        """Function that takes the number of finished iterations and their total. It evaluates the policy if that is due, and
-        returns the figures."""
+        """Function of the number of finished iterations and the total number. It evaluates the policy if an evaluation is
+        due, and returns the figures."""
         self.why_end: Callable[[], str] | None = None
         """Function that returns why the last evaluation ends the training, or an empty text; None if no process evaluates."""
         self.neighbours: Neighbours | None = None
-        """Counter of other trainings on this device, because they slow this one down. Only the first process has it;
-        elsewhere None."""
+        """Counter of other trainings on this device, which slow this one down. It is None in all processes but the first."""
         self.loop_s = 0.0
         """Time that this process has spent in iterations [s]."""
         self.return_std: float | None = None
-        """Standard deviation of the returns of the episodes that ended in the last rollout in which any ended. If it is None,
-        the standard deviation of rsl-rl's buffer of returns is logged."""
+        """Standard deviation of the episodes' returns in the last rollout in which an episode ended. If it is None, the
+        standard deviation of rsl-rl's buffer of returns is logged."""
         self.kl_meter: KLMeter | None = None
         """Recorder of the KL divergence in rsl-rl's own update."""
         self.latest: dict[str, float] = {}
-        """Last value of everything that the task logs. An entry is NaN until it has a value, such as an episode mean before
-        the first episode ends."""
+        """Last value of each log entry of the task. An entry without a value so far is NaN, for example an episode mean
+        before the first episode has ended."""
 
     @property
     def steps_per_iteration(self) -> int:
@@ -81,7 +80,7 @@ class QuietLogger(Logger):
             self.writer.close()
 
     def hand_over(self, iteration: int) -> None:
-        """Give the videos and reports in the run folder to the tracker, if there is one, and close it."""
+        """Give the videos and reports in the run folder to the tracker, if there is one, and close the tracker."""
         if isinstance(self.writer, Tracker):
             self.writer.hand_over(Path(self.log_dir), iteration)
 
@@ -107,7 +106,7 @@ class QuietLogger(Logger):
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
-        self.ep_extras[:] = [dict(values)] if values else []  # a copy, because rsl-rl adds tensors
+        self.ep_extras[:] = [dict(values)] if values else []  # a copy, because rsl-rl adds tensors to it
         kl = self.kl_meter.flush() if self.kl_meter else None
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}

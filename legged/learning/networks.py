@@ -19,7 +19,7 @@ from legged.learning.distributed import sum_over_ranks_
 from legged.learning.estimator import TARGETS
 
 UNBOUNDED = (1e-6, 1e6)
-"""Bounds of the standard deviation that rsl-rl applies by default."""
+"""Default bounds of rsl-rl for the standard deviation."""
 
 
 def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
@@ -36,7 +36,7 @@ def network_settings(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
 
 
 def _estimating(policy: PolicyConfig) -> dict[str, Any]:
-    """Return the further settings of an actor with an estimator; empty without one."""
+    """Return the settings that an estimator adds to the actor's; empty without an estimator."""
     estimator = policy.estimator
     if not estimator.targets:
         return {}
@@ -73,8 +73,8 @@ def actor_settings(policy: PolicyConfig) -> dict[str, Any]:
 
 
 def build_actor(cfg: TaskConfig, observations: TensorDict, num_actions: int) -> MLPModel:
-    """Build the policy's network alone, on the CPU, for observations with these shapes. The caller's random generators stay
-    untouched.
+    """Build the policy's network alone, on the CPU. Only the shapes of `observations` matter. The CPU's random generator
+    keeps its state.
     """
     settings = network_settings(cfg)
     kind, rest = resolve_class(settings["actor"])
@@ -106,7 +106,7 @@ def reset_std(actor: MLPModel, cfg: TaskConfig) -> None:
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
     """Clamp a learned standard deviation to its bounds after each step of the optimiser.
 
-    rsl-rl clamps it only where it is used. Outside the bounds the clamp has no gradient, so the parameter would never return.
+    rsl-rl clamps the value at each use. A parameter outside the bounds then has no gradient, so it would never return.
     """
     distribution = actor.distribution
     if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:
@@ -126,9 +126,9 @@ def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> Non
 def use_matmul(cfg: TaskConfig) -> None:
     """Set the precision of matrix products on a GPU, and their library on a CPU, for this process.
 
-    On processors with AVX-512 that are not Intel's, torch's default library MKL takes 2.5 times as long as oneDNN. torch uses
-    oneDNN if bfloat16 is allowed. Even then oneDNN computes in float32 on a processor without bfloat16 units (AMX). On a
-    processor with such units MKL stays.
+    On AVX-512 processors of other makers than Intel, torch's default library MKL takes 2.5 times as long as oneDNN. torch
+    uses oneDNN if bfloat16 is allowed. On a processor without bfloat16 units (AMX), oneDNN computes in float32 even then. On
+    a processor with these units bfloat16 is not allowed, so MKL is used.
     """
     rounded = cfg.train.runner.matmul == "tf32"
     torch.backends.cuda.matmul.allow_tf32 = rounded
@@ -148,7 +148,7 @@ def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
 
 
 def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> Tensor:
-    """Return the outputs (n, outputs), float32, of layers for `x` (n, width)."""
+    """Apply `layers` to `x` (n, width) and return the outputs (n, outputs), float32."""
     if x.device.type == "cpu" and not mixed_precision:
         return apply_layers(layers, x)
     return layers(x).float()
@@ -156,8 +156,8 @@ def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> 
 
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Update the running mean and variance with samples (n, width) of all processes, as rsl-rl does. The tensors are updated
-    in place, because a graph needs fixed addresses.
+    """Update the running mean and variance with the samples `x` (n, width) of all processes, as rsl-rl does. The tensors are
+    updated in place, because a graph needs fixed addresses.
     """
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
     count = len(x)

@@ -1,5 +1,5 @@
-"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are rsl-rl's, but losses are written in closed
-form and data is shuffled once per update.
+"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are those of rsl-rl, but losses are computed in
+closed form, and data is shuffled once per update.
 """
 
 import math
@@ -22,7 +22,7 @@ LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 FEW = 1e-8
 LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 """Logged losses of an update, by rsl-rl's names. `kl` is the divergence from the policy that acted to the policy that learns.
-`symmetry`, logged only with symmetry, is the distance of the policy from its mirror image."""
+`symmetry` is the mean square difference between the policy and its mirror image, logged only if symmetry is on."""
 HALF_LOG_2PI = 0.9189385332046727
 """Constant 0.5 * log(2 pi)."""
 
@@ -32,9 +32,9 @@ class DevicePPO(CriticWarmup):
 
     The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
     memory once per update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
-    divergence are written out. The optimiser is fused. Losses are summed on the device and read once. An actor's estimator
-    learns from the same mini-batches. If a feature needs rsl-rl's own update, `why_stock` names the feature and that update
-    runs.
+    divergence have closed forms. The optimiser is fused. Losses are summed on the device and read once per update. An actor's
+    estimator learns from the same mini-batches. If a feature needs rsl-rl's own update, `why_stock` names the feature and
+    that update runs.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -58,7 +58,7 @@ class DevicePPO(CriticWarmup):
         each term if there is an estimator, and the share of mini-batches that were used."""
         self._one = torch.ones((), device=self.device)
         self._critic_alone = False
-        """True while an update that changes the value function alone runs or is captured."""
+        """True during an update, or its capture, that changes only the value function."""
         self.left_out = 0.0
         """Share of the last update's mini-batches that were skipped, because a gradient was NaN or infinite."""
 
@@ -102,7 +102,7 @@ class DevicePPO(CriticWarmup):
     def _why_stock(self) -> str:
         """Return the first configured feature that only rsl-rl's own update supports, or an empty text."""
         if self.symmetry and self.symmetry.use_mirror_loss:
-            return "a mirror loss"
+            return "mirror_loss_coeff is above 0"
         for name, model in (("actor", self.actor), ("critic", self.critic)):
             if type(model) not in (MLPModel, EstimatingModel):
                 return f"the {name} is a {type(model).__name__}"
@@ -177,8 +177,8 @@ class DevicePPO(CriticWarmup):
                     self.optimizer.state[parameter].update({"step": step, **moments})
 
     def learn(self, epochs: int | None = None) -> None:
-        """Learn for all epochs, or for `epochs` of them, from the stored rollout. Nothing is read on the host, so one graph
-        can hold the update.
+        """Learn from the stored rollout for `epochs` epochs, by default all configured ones. Nothing is read on the host, so
+        one graph can hold the update.
         """
         self._losses.zero_()
         batches = self._mini_batches()
@@ -190,17 +190,17 @@ class DevicePPO(CriticWarmup):
         self._update_normalizers()
 
     def outcome(self) -> dict[str, Tensor]:
-        """Return the results of an update, on the device: `losses` (K,) in the form that the method `losses` takes, the
-        standard deviation `std` (D,) of the actions, and the learning `rate` ().
+        """Return the results of an update, on the device: `losses` (K,), which the method `losses` takes once they are on the
+        host, the standard deviation `std` (D,) of the actions, and the learning `rate` ().
         """
         rate = {} if self._rate is None else {"rate": self._rate}
         return {"losses": self._losses, "std": self.action_std(), **rate}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean losses of an update, and set `left_out`. Both come from `numbers`, the `losses` of an `outcome`. If
-        `numbers` is None, the results of the last update are read from the device.
+        """Return the mean losses of an update, and set `left_out`. `numbers` are the `losses` of `outcome`, read on the host;
+        if None, the last update's results are read from the device.
 
-        Losses are NaN if all mini-batches were skipped. The root mean square errors of the estimates follow as
+        Losses are NaN if all mini-batches were skipped. With an estimator, its root mean square errors are added as
         `Estimator/<term>_rmse`, each in the term's unit.
         """
         *losses, taken = self._losses.tolist() if numbers is None else numbers
@@ -245,7 +245,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples. It comes from a sort, because a graph can hold a sort."""
+        """Return a random permutation of `count` samples. It comes from sorting random numbers, which a graph can hold."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -261,8 +261,8 @@ class DevicePPO(CriticWarmup):
         old_std: Tensor,
         targets: Tensor | None = None,
     ) -> Tensor:
-        """Adapt the learning rate, take a gradient step on one mini-batch, and return its losses in the order of `LOSSES`,
-        followed by 1. If a gradient is NaN or infinite, change nothing and return zeros.
+        """Adapt the learning rate and take a gradient step on one mini-batch. Return its losses in the order of `LOSSES`, its
+        estimation errors, and 1. If a gradient is NaN or infinite, change nothing and return zeros.
         """
         samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
@@ -284,8 +284,8 @@ class DevicePPO(CriticWarmup):
         loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         errors: tuple[Tensor, ...] = ()
         if targets is not None and estimates is not None:
-            # One backward pass serves PPO's loss and the estimator's. They share parameters only if the estimator has
-            # `latent` outputs (its hidden layers) or `policy_gradient` is set (all of it).
+            # One backward pass serves PPO's loss and the estimator's. PPO's loss also trains the estimator's hidden layers if
+            # there are `latent` outputs, and the whole estimator if `policy_gradient` is set.
             loss = loss + (estimates - targets).square().mean()
             assert self._errors is not None
             errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()
@@ -297,7 +297,7 @@ class DevicePPO(CriticWarmup):
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
         losses.insert(LOSSES.index("kl"), kl)  # this tensor is averaged over the processes below
-        # A NaN value gives the clipped value loss no gradient, so the loss itself is checked as well.
+        # A NaN value may not show in the gradient of the clipped value loss, so the loss itself is checked as well.
         valued = value_loss.detach().clone()
         if self._critic_alone:
             loss = self.value_loss_coef * value_loss
@@ -318,11 +318,11 @@ class DevicePPO(CriticWarmup):
         return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
 
     def _step_critic(self, figures: list[Tensor], valued: Tensor) -> Tensor:
-        """Take the gradient step of the value function alone, with the loss `valued` (), and return `figures` and 1 as
-        `_step` does.
+        """Take a gradient step of the value function alone. Return `figures` and 1, or zeros if the value loss `valued` () or
+        a gradient is NaN or infinite.
 
-        The actor's gradients are set to None, because the optimiser skips parameters without a gradient. It would count zero
-        gradients as steps, and the first real steps would then be too large.
+        The actor's gradients are set to None, because the optimiser skips parameters without a gradient. With zero gradients
+        it would count a step, and the first real steps would then be too large.
         """
         of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
         for parameter, _ in of_actor:
@@ -330,7 +330,7 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # with several processes a view of the shared buffer
+        for parameter, gradient in of_actor:  # with several processes it is a view of the shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 
@@ -348,7 +348,7 @@ class DevicePPO(CriticWarmup):
         return norms.sum()
 
     def _act(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the mean actions (n, D) for the actor's inputs (n, width), and its estimates (n, E), or None without an
+        """Return the mean actions (n, D) for the actor's inputs (n, width), and the estimates (n, E), None without an
         estimator.
         """
         actor, mixed = self.actor, self.use_mixed_precision

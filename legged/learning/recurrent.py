@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 GATES = {4: "lstm", 3: "gru"}
-"""Number of gates (rows of a recurrent layer's weights, divided by its width) -> type of the layer."""
+"""Number of gates of a recurrent layer (rows of the weights, divided by the layer's width) -> type of the layer."""
 
 
 def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:
-    """Return the hidden states (layers, N, width) of those of rsl-rl's `networks` that are recurrent, as `<name>_<number>`. A
-    missing state is created as zeros.
+    """Return the hidden states (layers, N, width) of all recurrent `networks` of rsl-rl, by `<network>_<number>`. A missing
+    state is created as zeros.
     """
     found: dict[str, Tensor] = {}
     for name, network in networks.items():
@@ -65,7 +65,7 @@ class Memory:
     """
 
     def __init__(self, network: Any, num_envs: int, parts: list[Tensor] | None = None) -> None:
-        """Use the hidden state of the network itself, or the tensors `parts` (layers, N, width)."""
+        """Use the tensors `parts` (layers, N, width), or by default the hidden state of the network itself."""
         self.network = network
         self.parts = [*hidden_states({"": network}, num_envs).values()] if parts is None else parts
 
@@ -92,6 +92,6 @@ class Memory:
 
     @torch.no_grad()
     def take(self, parts: list[Tensor]) -> None:
-        """Copy the tensors of another Memory, in place."""
+        """Copy the tensors `parts` of another Memory into the tensors of this one."""
         for part, value in zip(self.parts, parts, strict=True):
             part.copy_(value)

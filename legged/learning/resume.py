@@ -29,7 +29,7 @@ def resumed(
     All errors are found here, before anything is built.
 
     Raises:
-        ConfigError: there is no such run, its task, robot, observations or networks differ, or it has finished.
+        ConfigError: there is no such run; its task, robot, observations or networks differ; or it has finished.
     """
     asked = list(asked)
     folders = [(key, value) for key, value in asked if key == "train.runner.experiment_name"]
@@ -51,7 +51,7 @@ def resumed(
     saved = read_checkpoint(path)
     check_fits(path, saved, cfg)
     if "optimizer_state_dict" not in saved:
-        raise ConfigError(f"{relative(path)}: holds no optimiser, so its training can't be resumed; it can only be played")
+        raise ConfigError(f"{relative(path)}: holds no optimiser, so its training can't be resumed; the policy can be played")
     check_optimizer(path, saved, cfg)
     done, until = saved["iter"] + 1, cfg.train.runner.max_iterations
     if done >= until:

@@ -1,4 +1,4 @@
-"""Rollout without host reads. Policy, sampling, task and returns write straight into rsl-rl's storage."""
+"""Rollout without host reads. Observations, actions, rewards and returns go straight into rsl-rl's storage."""
 
 from abc import ABC, abstractmethod
 
@@ -34,7 +34,7 @@ class Steps(ABC):
 
     @property
     def episodes(self) -> dict[str, Tensor]:
-        """Return and length so far of each robot's episode, (N,) each."""
+        """Sum of rewards (`return`) and `length` [steps] of each robot's episode so far, (N,) each."""
         return {"return": self._return, "length": self._length}
 
     def forget(self) -> None:
@@ -111,7 +111,7 @@ class Rollout(Steps):
         return actions
 
     def _finish(self) -> None:
-        """Compute log-probabilities, values, the rewards' time-out terms, returns and advantages."""
+        """Compute log-probabilities, values, returns and advantages. Add the discounted value to rewards at time-outs."""
         alg, st = self.alg, self.alg.storage
         std = alg.action_std()
         st.distribution_params[1].copy_(std.expand_as(st.actions))
@@ -119,12 +119,12 @@ class Rollout(Steps):
         st.values.copy_(alg.critic.mlp(alg.critic.get_latent(st.observations)))
         if alg.reward_scale != 1.0:
             st.rewards.mul_(alg.reward_scale)
-        # At a time-out the next state is a new episode's, so the value of the state before it is used, as in rsl-rl.
+        # At a time-out the next state is in a new episode, so the value of the last state is used, as in rsl-rl.
         st.rewards.add_(alg.gamma * self._cut_off * st.values)
         self._returns()
 
     def _returns(self) -> None:
-        """Compute generalised advantage estimation (Schulman et al., arXiv 1506.02438), backwards over the storage."""
+        """Compute returns and advantages by generalised advantage estimation (Schulman et al., arXiv 1506.02438)."""
         alg, st = self.alg, self.alg.storage
         last = alg.critic.mlp(alg.critic.get_latent(self._observations))
         following = torch.cat([st.values[1:], last.unsqueeze(0)])

@@ -34,7 +34,7 @@ GIT_S = 30.0
 
 
 def experiment_folder(cfg: TaskConfig) -> Path:
-    """Return the folder of a task's runs. The folder lies in logs/, because the configuration allows only plain names."""
+    """Return the folder of a task's runs. It is always in logs/, because the configuration allows no path as a name."""
     return LOGS / (cfg.train.runner.experiment_name or cfg.task)
 
 
@@ -53,7 +53,7 @@ def create_run(cfg: TaskConfig) -> Path:
         try:
             folder.mkdir()
             break
-        except FileExistsError:  # two runs in one second
+        except FileExistsError:  # another run began in this second
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error
@@ -73,7 +73,7 @@ def stamped(cfg: TaskConfig) -> str:
 
 def discard_run(folder: Path) -> None:
     """Remove the folder of a run that failed before its first checkpoint, and parent folders that are then empty. Keep a
-    folder that holds files of other origin.
+    folder that holds files which the run did not write.
 
     A state file without its checkpoint is removed too, because it is of no use.
     """
@@ -133,7 +133,7 @@ def _version() -> str:
 
 
 def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
-    """Return the run folder that `load_run` names: a name in the task's experiment, a path, or None for the newest.
+    """Return the run folder that `load_run` names: the name of a run of the task, a path, or None for the newest run.
 
     Raises:
         ConfigError: there is no such run.
@@ -148,7 +148,7 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
             raise ConfigError(f"{where}: there is no run with a checkpoint in {relative(parent)}{which}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
-        with suppress(OSError, ValueError):  # not a valid folder name
+        with suppress(OSError, ValueError):  # it may not be a valid folder name
             if str(load_run).strip() and folder.is_dir():
                 return folder
     raise ConfigError(f"--load-run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
@@ -160,8 +160,8 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
     The name can be one of these:
 
     - a run's folder, or `<experiment>/<run>` below logs/;
-    - a task or its YAML file: its newest run, or else its shipped policy;
-    - an experiment: its newest run.
+    - a task or its YAML file, for the task's newest run or else its shipped policy;
+    - an experiment, for its newest run.
 
     The run needs a checkpoint, unless `begun` allows a run without one. `where` is the argument that gave the name.
 
@@ -169,7 +169,7 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
         ConfigError: there is no such run.
     """
     top = data_folder("resources").parent
-    with suppress(OSError, ValueError):  # not a valid folder name
+    with suppress(OSError, ValueError):  # it may not be a valid folder name
         for folder in (parent / name for parent in (Path(), LOGS, top) if name.strip()):
             if exists(folder / CONFIG_FILE):
                 return folder
@@ -210,7 +210,7 @@ def own_run(name: str, where: str) -> Path:
 
 
 def newest_run(where: str) -> Path:
-    """Return the run folder in logs/ with the latest checkpoint; a run without a checkpoint counts by its start.
+    """Return the folder in logs/ of the run that saved a checkpoint last. A run without one counts by its start.
 
     Raises:
         ConfigError: there is no run.
@@ -226,15 +226,15 @@ def _has_begun(folder: Path) -> bool:
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
-    """Return a checkpoint of a run folder. `checkpoint` is its iteration, or BEST for the best one of the evaluations during
-    training, or None for the latest.
+    """Return a checkpoint of a run folder. `checkpoint` is an iteration, BEST for the best policy of the evaluations during
+    training, or None for the latest checkpoint.
 
     Raises:
         ConfigError: the folder has no such checkpoint.
     """
     if checkpoint == BEST:
         if not (folder / BEST_MODEL).is_file():
-            keeping = "with train.runner.evaluate_interval a training writes it"
+            keeping = "a training writes it if train.runner.evaluate_interval is set"
             raise ConfigError(f"--checkpoint: {relative(folder)} has no {BEST_MODEL}; {keeping}")
         return folder / BEST_MODEL
     found = checkpoints(folder)
@@ -249,8 +249,8 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
 
 
 def of_another_policy(folder: Path, checkpoint: object) -> bool:
-    """Return True if the file `checkpoint`, which was evaluated, is not the last policy in `folder`: the training has gone on
-    since, or an earlier checkpoint was evaluated. For a shipped policy return False, because its original file name is
+    """Return True if `checkpoint`, the name of an evaluated file, is not the last checkpoint in `folder`: training has gone
+    on since, or an earlier checkpoint was evaluated. For a shipped policy return False, because its original file name is
     unknown.
     """
     found = checkpoints(folder)
@@ -279,12 +279,12 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
 
 
 def _last_saved(folder: Path) -> float:
-    """Return the time at which the latest checkpoint of a run was written, or at which the run began if it has none [s since
-    1970]. Evaluations and videos in the folder do not count.
+    """Return when the latest checkpoint of a run was written, or when the run began if it has no checkpoint [s since 1970].
+    Evaluations and videos in the folder do not count.
     """
     stamps = []
     for path in list(checkpoints(folder).values()) or [folder / CONFIG_FILE]:
-        with suppress(OSError):  # removed in the meantime
+        with suppress(OSError):  # the file may have been removed
             stamps.append(path.stat().st_mtime)
     return max(stamps, default=0.0)
 

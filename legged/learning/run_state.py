@@ -58,14 +58,14 @@ def remove_older(checkpoint: Path) -> None:
 
 
 def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
-    """Read the state of a checkpoint. Its `id` must be `checkpoint_id`.
+    """Read the state of a checkpoint. The state's `id` must be `checkpoint_id`.
 
     Raises:
         StateError: there is no state, or it can't be used.
     """
     path = state_path(checkpoint)
     if not path.is_file():
-        raise StateError(f"there is no {path.name} next to it")
+        raise StateError(f"there is no {path.name} next to the checkpoint")
     try:
         state = load_plain(path)
     except ConfigError as error:
@@ -84,7 +84,7 @@ def check_same_world(before: TaskConfig, after: TaskConfig) -> None:
     """Check that the robots of a run can continue from their state under the configuration `after`.
 
     Raises:
-        StateError: a setting that is part of the state has changed.
+        StateError: one of `STATE_SETTINGS` has changed.
     """
     for name, (was, now) in differences([to_dict(before), to_dict(after)]).items():
         if any(name == path or name.startswith(f"{path}.") for path in STATE_SETTINGS):
@@ -119,7 +119,7 @@ def set_generators(state: dict[str, Any]) -> None:
         if isinstance(state["cuda"], Tensor) and torch.cuda.is_available():
             torch.cuda.set_rng_state(state["cuda"])
     except Exception as error:  # each generator raises its own types for a wrong state
-        raise StateError(f"its random generators are damaged ({error})") from error
+        raise StateError(f"the state of the random generators is damaged ({error})") from error
 
 
 @contextmanager

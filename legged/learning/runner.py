@@ -83,7 +83,7 @@ def loop_settings(runner: RunnerConfig) -> dict[str, Any]:
         "save_interval": runner.save_interval,
         "run_name": runner.run_name,
         "logger": runner.logger,
-        "check_for_nan": False,  # it would wait for the GPU at every step; the task itself resets and counts such robots
+        "check_for_nan": False,  # the check waits for the GPU at every step; the task itself resets robots with NaN
     }
 
 
@@ -168,8 +168,8 @@ class Runner(OnPolicyRunner):
         return found
 
     def train(self, until_iteration: int) -> bool:
-        """Train up to iteration `until_iteration` or to the target, and leave a checkpoint. Return False if the training was
-        stopped earlier. At the end, leave the process group.
+        """Train up to iteration `until_iteration`, or until the target is reached, and save a checkpoint. Return False if the
+        training was stopped earlier. At the end, leave the process group.
 
         Raises:
             RankLost: another process has died.
@@ -179,8 +179,7 @@ class Runner(OnPolicyRunner):
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # With several processes only a reached target raises Ended. A process without evaluations learns of it from the
-            # first one.
+            # Processes without evaluations get Ended too. With several processes it means that the target is reached.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -192,7 +191,7 @@ class Runner(OnPolicyRunner):
             good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
             raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
-            if self.is_distributed and "by peer" in str(error):  # gloo's text; NCCL's case torchrun reports
+            if self.is_distributed and "by peer" in str(error):  # gloo's text; with NCCL, torchrun reports
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
             raise
         leave()
@@ -220,13 +219,13 @@ class Runner(OnPolicyRunner):
         super().learn(num_learning_iterations, init_at_random_ep_len and not goes_on)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """Write a checkpoint, and next to it the state of everything else. Only the newest checkpoint keeps a state.
+        """Write a checkpoint, and next to it the rest of the state (run_state.py). States of older checkpoints are removed.
 
         Raises:
             RunError: weights are NaN or infinite, or a file can't be written.
         """
         saved = self._content(Path(path), infos)
-        if not self.is_distributed:  # this process lacks the others' robots
+        if not self.is_distributed:  # each process has only its own robots
             saved["infos"]["id"] = uuid4().hex
             state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
             state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
@@ -237,7 +236,7 @@ class Runner(OnPolicyRunner):
         self.logger.save_model(path, self.current_learning_iteration)
 
     def _content(self, path: Path, infos: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Return the content of a checkpoint, with `infos` added to its own.
+        """Return the content of a checkpoint, with the entries of `infos` added.
 
         Raises:
             RunError: weights are NaN or infinite; the text names `path`, which is not written.
@@ -271,7 +270,7 @@ class Runner(OnPolicyRunner):
         infos = saved["infos"]
         self._load_learner(Path(path), saved, load_cfg, strict)
         self._transferred_from = infos.get("transferred_from")
-        # rsl-rl saves the index of the last finished iteration. The next one follows it.
+        # rsl-rl saves the index of the last finished iteration. Training continues with the next index.
         self.current_learning_iteration = saved["iter"] + 1
         try:
             if "task_state" in infos:
@@ -291,7 +290,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            waiting = len([*self.alg.get_policy().parameters()])  # the policy's parameters may lack moments
+            waiting = len([*self.alg.get_policy().parameters()])  # in a critic warm-up the policy has no moments
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
@@ -328,7 +327,7 @@ class Runner(OnPolicyRunner):
         return transfer_summary(Path(path), saved, self.alg.get_policy(), self.env.cfg, self.alg.learning_rate)
 
     def resume(self, path: str) -> str:
-        """Load a checkpoint and continue its training. Return the reason why robots begin anew, or an empty text if they
+        """Load a checkpoint, to continue its training. Return the reason why robots begin anew, or an empty text if they
         continue.
 
         Robots, random numbers and episodes continue if the checkpoint has a state, and the terrain and the randomisation are
@@ -367,9 +366,7 @@ class Runner(OnPolicyRunner):
         set_generators(state["generators"])
 
     def _episodes(self) -> dict[str, Tensor]:
-        """Return the sum of rewards and the length so far of each environment's episode, (N,) each, as counted for the
-        log.
-        """
+        """Return the sum of rewards and the length of each environment's episode so far, (N,) each, for the log."""
         return {"return": self.logger.cur_reward_sum, "length": self.logger.cur_episode_length}
 
     def _memory(self) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ class StudentRollout(Steps):
         self.student, self.teacher = alg.memory, Memory(alg.teacher, env.num_envs)
 
     def forget(self) -> None:
-        """Reset all episodes and hidden states."""
+        """Reset all returns and lengths of episodes, and all hidden states."""
         super().forget()
         for memory in (self.student, self.teacher):
             for part in memory.parts:
@@ -53,6 +53,6 @@ class StudentRollout(Steps):
                 part.masked_fill_(self.env.reset_buf.unsqueeze(1), 0.0)
 
     def _finish(self) -> None:
-        """Compute the actions of a teacher without recurrent layers for all steps at once."""
+        """Compute the teacher's actions for all steps at once, unless the teacher has recurrent layers."""
         if not self.teacher.parts:
             self.storage.privileged_actions.copy_(self.alg.teacher(self.storage.observations))

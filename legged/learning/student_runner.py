@@ -16,7 +16,7 @@ from legged.learning.teacher import Teacher
 
 
 class StudentRunner(CapturedRunner):
-    """CapturedRunner for a student. Its checkpoints hold the student as the actor, the teacher, and no value function."""
+    """CapturedRunner for a student. Checkpoints hold the student (as the actor) and the teacher, but no critic."""
 
     ALGORITHM = "legged.learning.distillation:DeviceDistillation"
 

@@ -10,7 +10,7 @@ from legged.mdp.mirror_images import MirrorImages
 
 
 def images_of(task: BaseTask) -> MirrorImages:
-    """Return the mirror images of a task.
+    """Return the mirror images of a task's observations and actions.
 
     Raises:
         ConfigError: the task has no mirror images, or a term's width does not fit the term's kind in `MIRRORED`.
@@ -18,7 +18,7 @@ def images_of(task: BaseTask) -> MirrorImages:
     images = task.mirror_images()
     if images is None:
         where = task.cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images; must be false")
+        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images, so this must be false")
     return images
 
 

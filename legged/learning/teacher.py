@@ -43,7 +43,7 @@ class Teacher:
     groups: Mapping[str, ObservationGroupConfig]
     """Observation groups that the policy reads, in order and without noise, by their names in the student's task."""
     network: Mapping[str, Any]
-    """Description of the network, as in checkpoints. Its entry `observations` has the names in the student's task."""
+    """Description of the network, as in checkpoints. `observations` has the groups' names in the student's task."""
     weights: Mapping[str, Tensor]
 
     @property
@@ -76,7 +76,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
     check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)
     if there.train.policy.estimator.targets:
-        raise ConfigError(f"{where}: {relative(path)} has an estimator, which a teacher can't have")
+        raise ConfigError(f"{where}: {relative(path)} has an estimator; a teacher can't have one")
     read = groups_of(there, "actor")
     groups = {PREFIX + group: replace(there.observations.groups[group], noise=False) for group in read}
     terms = dict.fromkeys(term for group in groups.values() for term in group.terms)
@@ -119,7 +119,7 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
 
 
 def _observed_as(cfg: TaskConfig, name: str) -> str:
-    """Return a text for the range that scales an observed property."""
+    """Return the range by which an observed property is scaled, as text."""
     draw = observed(cfg, name)
     if draw is None:
         return "not drawn"
@@ -128,13 +128,13 @@ def _observed_as(cfg: TaskConfig, name: str) -> str:
 
 
 def _largest_forces(cfg: TaskConfig) -> str:
-    """Return a text for the forces that scale the observed ones."""
+    """Return a text with the largest forces, which scale the observed forces."""
     forces = observed_forces(cfg) if isinstance(cfg, LeggedConfig) else {}
     return ", ".join(f"{name} up to {largest_of(force):g} N" for name, force in forces.items()) or "none"
 
 
 def _shown(value: Any) -> str:
-    """Return a value as text for an error. A long list is given by its length, and numbers also by the first and last."""
+    """Return a value as text for an error. The text of a long list has only its length and, for numbers, its ends."""
     if isinstance(value, tuple) and len(value) > 3:
         return f"{len(value)} from {value[0]:g} to {value[-1]:g}" if isinstance(value[0], float) else f"{len(value)} names"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -159,8 +159,8 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
         if groups.get(name, group) != group:
             where = cfg.origins.where(f"observations.groups.{name}")
             raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
-    # A student has no value function and does not learn from mirror images, so the teacher's observations need no mirror
-    # kind.
+    # A student has no value function to warm up. It does not learn from mirror images, so the teacher's observations need no
+    # mirror kind.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
     return replace(
         cfg,
@@ -181,7 +181,7 @@ def teacher_in(path: Path, saved: Saved) -> Teacher:
         layouts, histories = infos["observations"], infos["histories"]
         groups = {group: ObservationGroupConfig(tuple(layouts[group]), histories[group]) for group in network["observations"]}
         teacher = Teacher({"file": name, "task": "", "iteration": 0, **infos["teacher"]}, groups, network, weights)
-        teacher.policy  # noqa: B018 (it is complete)
+        teacher.policy  # noqa: B018 (fails if an entry is missing)
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{name}: holds no teacher to continue with ({error})") from error
     check_weights(saved["teacher_state_dict"], f"{name}: its teacher")

@@ -14,7 +14,7 @@ TIMING_FILE = "timing.json"
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of one training process, with the work done in them."""
+    """Times of one training process, and the amount of its work."""
 
     task: str
     finished: bool
@@ -27,7 +27,7 @@ class Timing:
     steps: int
     """Control steps of all robots."""
     start_up_s: float
-    """Time until everything was built, with imports and the compilation of kernels [s]."""
+    """Time until everything was built, including imports and the compilation of kernels [s]."""
     loop_s: float
     """Time in iterations [s]. It includes logging, except in rsl-rl's own loop."""
     wall_s: float

@@ -1,5 +1,5 @@
-"""Experiment trackers, such as W&B, that run next to TensorBoard through rsl-rl's writers. They are optional, and a failing
-tracker does not end a training.
+"""Experiment trackers, such as W&B, that get the log in addition to TensorBoard, through rsl-rl's writers. They are optional,
+and a failing tracker does not end a training.
 """
 
 import inspect
@@ -30,7 +30,7 @@ def check_tracker(cfg: TaskConfig) -> None:
     """Check that the configured tracker is available.
 
     Raises:
-        ConfigError: the tracker is unknown or not installed, or is not a writer.
+        ConfigError: the tracker is unknown or not installed, or its class is not a LogWriter.
     """
     if cfg.train.runner.logger != TENSORBOARD:
         _writer_class(cfg)
@@ -69,7 +69,7 @@ def open_writer(cfg: TaskConfig, folder: str) -> "SummaryWriter | Tracker":
 
     Raises:
         ConfigError: as in `check_tracker`.
-        RunError: the tracker does not start, because a login or a connection is missing.
+        RunError: the tracker does not start, for example because a login is missing.
     """
     runner = cfg.train.runner
     if runner.logger == TENSORBOARD:
@@ -98,7 +98,7 @@ class _Plain:
 
 
 class Tracker(LogWriter):
-    """Writer to TensorBoard and a tracker. If the tracker fails once, it is left out from then on, after a warning."""
+    """Writer to TensorBoard and a tracker. A tracker's first failure gives a warning; then it is not used any more."""
 
     def __init__(self, writer: LogWriter, folder: str) -> None:
         """Take the tracker's `writer`, which may write TensorBoard's file itself, as rsl-rl's writers do."""
@@ -131,7 +131,7 @@ class Tracker(LogWriter):
         self._tensorboard.close()
 
     def hand_over(self, folder: Path, iteration: int) -> None:
-        """Give the tracker the videos and reports of a run folder, then close it."""
+        """Give the tracker the videos and reports of a run folder, then close the tracker."""
         for pattern in FILES:
             for path in sorted(folder.glob(pattern)):
                 self.save_file(str(path))
@@ -148,4 +148,4 @@ class Tracker(LogWriter):
         except Exception as error:  # errors of the network or the tracker
             self._failed = True
             text = " ".join(str(error).split()) or type(error).__name__
-            print(f"warning: the tracker has failed and is left out: {text[:300]}", file=sys.stderr, flush=True)
+            print(f"warning: the tracker has failed and is no longer used: {text[:300]}", file=sys.stderr, flush=True)

@@ -45,7 +45,7 @@ def transferred(
     """
     cfg = task_config(task, overrides, on_cpu)
     if learns_from_teacher(cfg):
-        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and begins anew; --teacher names the teacher")
+        raise ConfigError(f"--transfer: '{cfg.task}' learns from a teacher, and can't begin with a policy; use --teacher")
     path = find_checkpoint(run_named(source, "--transfer"), iteration)
     check_source(path, read_checkpoint(path), cfg)
     return cfg, path
@@ -60,8 +60,8 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     saved = transferable_parts(saved, cfg)
     if "critic_state_dict" not in saved and not cfg.train.algorithm.critic_warmup_iterations:
         raise ConfigError(
-            f"{relative(path)}: holds a policy alone, without a value function; it can be played, not trained on"
-            " (train.algorithm.critic_warmup_iterations=50 would train a new value function first)"
+            f"{relative(path)}: holds a policy without a value function, so a training can't begin with it"
+            "; train.algorithm.critic_warmup_iterations=50 trains a new value function first"
         )
     check_joints(relative(path), made_for(path, saved), cfg)
     there = terms_of(path, saved)
@@ -74,7 +74,7 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
 
 
 def transferable_parts(saved: Saved, cfg: TaskConfig) -> Saved:
-    """Return the parts of a checkpoint with which a training of `cfg` begins: all parts, or only the policy if a new value
+    """Return the parts of a checkpoint that a training of `cfg` begins with: all parts, or only the policy if a new value
     function is to be trained first.
     """
     if not cfg.train.algorithm.critic_warmup_iterations:
@@ -87,7 +87,7 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
     """Compare the observations and actions of a built task, including their widths, with those of a checkpoint.
 
     Raises:
-        ConfigError: they differ.
+        ConfigError: the observations or the actions differ.
     """
     cfg = task.cfg
     here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
@@ -131,7 +131,7 @@ def _check_observations(
     steps_there: Mapping[str, int],
     networks: Iterable[str],
 ) -> None:
-    """Compare the groups that `networks` read, term by term.
+    """Compare the observation groups that `networks` read, term by term: the task's (`here`) and the checkpoint's (`there`).
 
     Raises:
         ConfigError: groups differ. The text gives the first difference of each group.
@@ -165,7 +165,7 @@ def _shown(term: tuple[str, int | None] | None) -> str:
 
 
 def transfer_summary(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
-    """Return a text of two lines: the parts of a checkpoint that the networks hold now, and the parts that begin anew."""
+    """Return two lines of text: the parts that were taken from a checkpoint, and the parts that begin anew."""
     sizes = [_sizes(network) for network in described_networks(saved).values()]
     alone = len(sizes) == 1
     networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[-1]}"
@@ -183,7 +183,7 @@ def transfer_summary(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, lear
     if "optimizer_state_dict" in saved and ours == theirs:
         taken.append(f"{OPTIMIZERS[ours]}'s state")
     else:
-        why = "it holds none" if ours == theirs else f"it trained with {OPTIMIZERS.get(theirs, theirs)}"
+        why = "not in the checkpoint" if ours == theirs else f"the checkpoint's optimiser is {OPTIMIZERS.get(theirs, theirs)}"
         taken.append(f"no state of {OPTIMIZERS[ours]} ({why})")
     fixed = " (fixed, the configuration's)" if cfg.train.algorithm.schedule == "fixed" else ""
     taken.append(f"learning rate {learning_rate:.2g}{fixed}")

@@ -15,7 +15,7 @@ LOOK_AGAIN = 20
 class UpdateThreads:
     """Chooser of the number of torch threads for the next update. It compares the times of the last updates.
 
-    With several threads an operation ends when the slowest thread gets its core. If another program takes one core of two,
+    With several threads an operation ends only when its slowest thread ends. If another program occupies one of two cores,
     one thread is faster. The results do not depend on the number of threads (cpu_layers.py).
     """
 
@@ -52,7 +52,7 @@ class UpdateThreads:
         if used == self._most:
             shared = seconds > SLOWER * self._best[used]
             unknown = 1 not in self._last
-            # Try one thread once, and again whenever updates with all threads have become slow.
+            # Use one thread if this has not been tried, if it was faster, or if all threads have become slow.
             self.count = 1 if shared or unknown or self._last[1] < seconds else self._most
             if self.count == 1:
                 self._since = 0

@@ -1,4 +1,4 @@
-"""Rough ground: tile generators, one height map, and sampling of its heights."""
+"""Terrain: generators of tiles, a height map of all tiles, and look-ups in it."""
 
 from legged.terrain.generators import BUMPS, METRES, TERRAIN_TYPES, terrain_type, terrain_types
 from legged.terrain.height_map import HeightMap

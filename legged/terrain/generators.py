@@ -1,4 +1,4 @@
-"""Tiles of terrain, made by one small NumPy function per type. Names and sizes are legged_gym's (arXiv 2109.11978).
+"""Tiles of terrain. A small NumPy function makes each type. Names and sizes mostly follow legged_gym (arXiv 2109.11978).
 
 Every generator takes a `Tile` of zeros and a size that depends on the difficulty, in metres or degrees, and fills in the
 heights of the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
@@ -45,7 +45,7 @@ NARROWEST_DITCH = 0.5
 
 @dataclass(frozen=True)
 class Tile:
-    """A rectangle of square cells: `heights` (length, width) [m], one per cell, x along the first axis."""
+    """Rectangle of square cells. `heights` (length, width) has a height for each cell [m], x along the first axis."""
 
     heights: np.ndarray
     cell: float
@@ -55,11 +55,11 @@ class Tile:
     scale: float = 1.0
     """Factor on the lengths of the type."""
     tread: float | None = None
-    """Width of a step of stairs [m]; None for the type's own. The scale does not multiply it."""
+    """Width of a step of stairs [m]; None for the type's own width. The scale does not multiply this width."""
 
     def cells(self, metres: float) -> int:
-        """Return the number of whole cells in a length [m] times the tile's scale. A cell that is incomplete by a rounding
-        error counts as whole, because scales and cells are rounded to six digits.
+        """Multiply a length [m] by the tile's scale, and return the number of whole cells in it. A cell that is incomplete by
+        a rounding error counts as whole, because scales and cells are rounded to six digits.
         """
         return int(metres * self.scale / self.cell + 1e-3)
 
@@ -69,7 +69,7 @@ class Tile:
         return np.maximum(x[:, None], y[None, :])
 
     def middle(self, side: float) -> tuple[slice, slice]:
-        """Return the cells of a centred square with side `side` [m] times the scale, or its part on the tile."""
+        """Return the cells of a centred square with sides of `side` [m] times the scale, cut off at the tile's edge."""
         spans = []
         for n in self.heights.shape:
             first = max(0, (n - self.cells(side)) // 2)
@@ -78,7 +78,7 @@ class Tile:
 
 
 def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
-    """Make a pyramid with a flat top (or, for a negative angle, bottom) and its foot at the tile's edge."""
+    """Make a pyramid with its foot at the tile's edge and a flat top. A negative angle makes a hollow with a flat bottom."""
     distance = 0.5 * min(tile.heights.shape) * tile.cell - tile.from_centre()
     edge = 0.5 * (min(tile.heights.shape) * tile.cell - platform * tile.scale)
     tile.heights[:] = tan(radians(degrees_up)) * np.clip(distance, 0.0, edge)
@@ -104,8 +104,8 @@ def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.
 
 
 def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD) -> None:
-    """Make rings of steps up to a platform in the middle (down, for a negative riser). Steps are as wide as the tile's tread
-    or, if the tile has none, as `tread`, cut to whole cells.
+    """Make rings of steps that rise to a platform in the middle, or fall to it if `riser` is negative. Steps are as wide as
+    the tile's tread or, if this is None, as `tread`. The width is cut to whole cells.
     """
     width = max(1, tile.cells(tread if tile.tread is None else tile.tread / tile.scale))
     across = tile.cells(platform)
@@ -116,7 +116,7 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
 
 
 def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
-    """Make a raised ring around the platform: one step up and, a ledge further out, one step down."""
+    """Make a raised ring around the platform. On the way outward it is one step up and, after the ledge, one step down."""
     along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # cut to whole cells
     outer, inner = tile.middle(platform + 2.0 * along), tile.middle(platform)
     tile.heights[outer] = height
@@ -124,8 +124,8 @@ def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE)
 
 
 def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
-    """Make rectangular blocks and pits of 1 to 2 m, with a height or depth of `height` or half of it, anywhere but in the
-    middle.
+    """Make rectangular blocks and pits, anywhere but in the middle. Their sides are 1 to 2 m long. Heights and depths are
+    `height` or half of it.
     """
     rows, columns = tile.heights.shape
     sides = [max(1, tile.cells(0.1 * tenths)) for tenths in range(10, 20, 4)]
@@ -173,8 +173,8 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
     """Stack overlapping blocks on the whole tile except its middle.
 
     Sides are drawn from BLOCK_SIDES. Tops are at 0, 1, 2, 3 or 4 quarters of `height`. Where blocks overlap, the later one
-    counts. The sum of the blocks' areas is `cover` times the tile's. So a robot meets a face of up to `height` every few
-    steps, and hardly ever a level stretch as long as the robot.
+    counts. The sum of the blocks' areas is `cover` times the area of the tile. At the default, a robot meets a face of up to
+    `height` every few steps, and hardly ever a level stretch as long as itself.
     """
     rows, columns = tile.heights.shape
     left = cover * rows * columns
@@ -187,8 +187,8 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
 
 
 def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = GRID) -> None:
-    """Cover the tile with squares as Isaac Lab's boxes do. Each square is at -1/2, -1/4, 0, 1/4 or 1/2 of `height`. Steps up
-    and down follow each other more closely than on stairs and obstacles, in no regular order.
+    """Cover the tile with a grid of squares, as Isaac Lab's random grid does. Each square is at -1/2, -1/4, 0, 1/4 or 1/2 of
+    `height`. Steps up and down follow each other more closely than on stairs and obstacles, in no regular order.
     """
     across = max(1, tile.cells(side))
     rows, columns = (-(-n // across) for n in tile.heights.shape)
@@ -198,7 +198,7 @@ def random_grid(tile: Tile, height: float, platform: float = 2.0, side: float = 
 
 
 def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB, spacing: float = KERB_SPACING) -> None:
-    """Make rings of kerbs on level ground around the platform, one every `spacing`."""
+    """Make rings of kerbs on level ground around the platform, at distances of `spacing` [m]."""
     across, every, inner = max(1, tile.cells(width)), max(2, tile.cells(spacing)), tile.cells(platform)
     rows, columns = tile.heights.shape
     innermost = max(0, (min(rows, columns) - inner) // 2) - across
@@ -211,9 +211,9 @@ def kerbs(tile: Tile, height: float, platform: float = 2.0, width: float = KERB,
 def rubble(tile: Tile, height: float, platform: float = 2.0, cover: float = 2.0) -> None:
     """Cover the tile except its middle with slabs of stone.
 
-    Sides are drawn from STONE_SIDES, edges lie at any angle, and tops are at 1, 2, 3 or 4 quarters of `height`. Where stones
-    overlap, the higher one counts. The sum of the stones' areas is `cover` times the tile's. So faces lie at any angle, with
-    ragged edges (cells are square), and few tops are large enough for a whole foot.
+    Sides are drawn from STONE_SIDES, directions are random, and tops are at 1, 2, 3 or 4 quarters of `height`. Where stones
+    overlap, the higher one counts. The sum of the stones' areas is `cover` times the area of the tile. Faces are ragged,
+    because cells are square. Few tops are large enough for a whole foot.
     """
     rows, columns = tile.heights.shape
     step = tile.cell / tile.scale
@@ -235,7 +235,7 @@ def flat(tile: Tile, size: float = 0.0) -> None:
 
 @dataclass(frozen=True)
 class TerrainType:
-    """A type of tile: its generator and the size of its difficulty."""
+    """Type of tile: its generator, and the meaning of its difficulty."""
 
     generate: Callable[[Tile, float], None]
     """Generator, called with a tile and a size in `unit`."""
@@ -243,7 +243,7 @@ class TerrainType:
     """Difficulty -> size at scale 1, in `unit`. Training begins at difficulty 0; difficulty 1 is one row past the hardest."""
     unit: str
     what: str
-    """Name of the size."""
+    """Name of the size, such as "step height"."""
     stepped: bool
     """True if the type consists of steps with vertical faces instead of slopes."""
     regular: bool = True
@@ -251,15 +251,14 @@ class TerrainType:
     platform: float = 3.0
     """Side of the level square in the middle at scale 1 [m]."""
     finest: tuple[float, str] | None = None
-    """Length of the smallest part of a tile of scale 1 [m], and its name; cells must not be larger."""
+    """Length [m] and name of the smallest part of a tile of scale 1; cells must not be larger than this part."""
     exact: bool = False
-    """True if the smallest part must be a whole number of cells, because other cells would change the ground. Evaluations
-    check this.
-    """
+    """True if the length of the smallest part must be a whole number of cells, because rounding it would change the ground.
+    Evaluations choose their cells accordingly."""
 
     def sized(self, difficulty: float, scale: float) -> float:
-        """Return the size at a difficulty on tiles of a scale, in `unit`: lengths are multiplied by the scale, angles are
-        not.
+        """Return the size at a difficulty, in `unit`. The size is multiplied by `scale`, the scale of the tiles, unless it is
+        an angle.
         """
         return self.size(difficulty) * (scale if self.unit == METRES else 1.0)
 
@@ -297,7 +296,7 @@ OF_DITCH = (NARROWEST_DITCH, "width of a ditch")
 
 
 def narrow_stairs(up: float) -> TerrainType:
-    """Return the type of stairs with treads as in a house. The platform is at their top, or at their bottom if `up` is -1."""
+    """Return a type of stairs with treads as in a house. The platform is at the top, or at the bottom if `up` is -1."""
     return TerrainType(
         lambda tile, size: stairs(tile, up * size, tread=NARROW_TREAD),
         _riser,
@@ -354,11 +353,11 @@ TERRAIN_TYPES: dict[str, TerrainType] = {
     "gap": TerrainType(gap, lambda d: 1.0 * d, METRES, "width", stepped=True, finest=OF_DITCH),
     "pit": TerrainType(pit, lambda d: 1.0 * d, METRES, "depth", stepped=True, platform=4.0),
 }
-"""Every type by its name in `terrain.proportions`."""
+"""Name in `terrain.proportions` -> terrain type."""
 
 
 def terrain_type(name: str, where: str) -> TerrainType:
-    """Return the type of that name; `where` is the place of the name, for the error.
+    """Return the terrain type `name`. `where` is the place of the name, for the error.
 
     Raises:
         ConfigError: there is no type of that name.

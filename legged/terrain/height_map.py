@@ -11,7 +11,7 @@ CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 @dataclass(frozen=True)
 class HeightMap:
     """Terrain of X x Y cells. Within a cell the height is interpolated bilinearly from the four corners. Where corners of
-    neighbouring cells differ, there is a vertical face. Outside the map the cells at the border continue.
+    neighbouring cells differ, there is a vertical face. Outside the map the height is that of the nearest point on the map.
     """
 
     heights: np.ndarray
@@ -25,11 +25,11 @@ class HeightMap:
 
     @classmethod
     def of(cls, heights: np.ndarray, cell: float, origin: tuple[float, float], steepest: np.ndarray) -> "HeightMap":
-        """Return the height map of the cell heights `heights` (X, Y), with cells joined where no face is between them.
+        """Return a height map with the `heights` (X, Y). Neighbouring cells are joined unless a face is between them.
 
-        `steepest` (X, Y) is the largest slope (rise over run) that stays a slope. Two cells have a vertical face between them
-        if the slope between their centres exceeds the smaller of their two values. legged_gym makes these faces from a
-        triangle mesh by one threshold for all types.
+        `steepest` (X, Y) is a limit of the slope (rise over run) for each cell. Two cells have a vertical face between them
+        if the slope between their centres exceeds the smaller one of their limits. legged_gym makes such faces in a triangle
+        mesh, with one limit for all types.
         """
         return cls(heights, join(heights, cell * steepest), cell, origin)
 
@@ -55,7 +55,7 @@ class HeightMap:
         return low * (1.0 - v) + high * v
 
     def ceiling(self, reach: int) -> np.ndarray:
-        """Return (X, Y) float32: the highest corner of the cells that are at most `reach` cells away along x and y [m]."""
+        """Return for each cell the highest corner of all cells up to `reach` cells away in x and y, (X, Y) float32 [m]."""
         top = self.corners.max(axis=2)
         for axis in (0, 1):
             padded = np.pad(top, [(reach, reach) if a == axis else (0, 0) for a in (0, 1)], mode="edge")
@@ -65,7 +65,7 @@ class HeightMap:
 
     def scan_map(self, scan: str) -> np.ndarray:
         """Return (X, Y) float32: the height that a height scan measures in each cell [m]. `scan` is the setting terrain.scan.
-        "lowest" takes the lowest of the cell and its next neighbours in x and y, as legged_gym does at a vertical face.
+        "lowest" takes the lowest of the cell and its next neighbours along +x and +y, as legged_gym does at a vertical face.
         """
         if scan == "own":
             return self.heights.astype(np.float32)
@@ -75,7 +75,7 @@ class HeightMap:
 
 
 def join(heights: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return the corner heights (X, Y, 4) [m]. Cells that are joined at a lattice point have their mean height there.
+    """Return the corner heights (X, Y, 4) [m]. Cells that are joined at a lattice point get the mean of their heights there.
 
     Two neighbours are joined if their heights differ by at most the smaller of their `rise` [m]. Cells that are joined
     through a common neighbour around the point count as joined too.

@@ -13,11 +13,11 @@ from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
-"""Side at scale 1 of the square in the middle of a tile. Robots start at the height of the square's highest point [m]."""
+"""Side at scale 1 of the square in the middle of a tile [m]. Robots start at the height of the square's highest point."""
 EDGE = 1.0
-"""A robot that is nearer than this to the end of the map has left the map [m]."""
+"""A robot counts as having left the map if it is nearer than this to the map's end [m]."""
 WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
-"""Difficulties from which each row draws one if the terrain has no curriculum."""
+"""Difficulties of a terrain without a curriculum. Each row gets one of them at random."""
 MOST_TILES = 10_000
 """Largest number of tiles; each is generated separately."""
 MOST_CELLS = 2**24
@@ -51,7 +51,7 @@ class Terrain:
 
     @classmethod
     def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
-        """Return the terrain for training. Each type has columns according to its share. In a curriculum rows get harder."""
+        """Return the terrain for training. Types have columns by their shares. In a curriculum, later rows are harder."""
         columns = column_types(cfg.proportions, cfg.num_cols)
         rng = np.random.default_rng(seed)
         rows = []
@@ -62,7 +62,7 @@ class Terrain:
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """Return a terrain of the given tiles. From `cfg` it takes only lengths, the scale and the slope threshold."""
+        """Return a terrain of the given tiles. It uses only the lengths, the scale and the slope threshold of `cfg`."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -106,7 +106,7 @@ class Terrain:
 
 
 def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
-    """Return the size of a tile of the type `name` in a row of that difficulty, in the type's unit [m or degrees]."""
+    """Return the size of a tile of type `name` at a difficulty, in the type's unit [m or degrees]."""
     asked, kind = cfg.sizes.get(name), TERRAIN_TYPES[name]
     if asked is None:
         return kind.sized(difficulty, cfg.scale)
@@ -123,7 +123,7 @@ def hardest_difficulty(cfg: TerrainConfig) -> float:
 
 
 def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
-    """Return the type of each column: the type whose share of the unit interval holds the column's middle."""
+    """Return the type of each column: the type at its middle, if the types lie side by side, as wide as their shares."""
     names = [name for name, share in proportions.items() if share > 0.0]
     ends = np.cumsum([proportions[name] for name in names])
     middles = (np.arange(num_cols) + 0.5) / num_cols
@@ -134,8 +134,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     """Check all values of a terrain's configuration.
 
     Raises:
-        ConfigError: a value is wrong. The text names the field, the value that it contradicts, and from `origins` where both
-            were set.
+        ConfigError: a value is wrong. The text names the field, the value that it contradicts, and where both were set (from
+            `origins`).
     """
     if cfg.mesh_type == "plane":
         return

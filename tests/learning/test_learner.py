@@ -195,7 +195,7 @@ def test_normalisers_are_updated_in_place():
 
 def test_what_needs_rsl_rls_update_is_named():
     alg = learner(DevicePPO, symmetry_cfg={**MIRROR, "use_mirror_loss": True})
-    assert alg.why_stock == "a mirror loss"
+    assert alg.why_stock == "mirror_loss_coeff is above 0"
     assert learner(DevicePPO, optimizer="sgd").why_stock == "the optimiser is SGD"
     fill(alg, 0)
     assert set(alg.update()) == {"value", "surrogate", "entropy", "symmetry"}  # by rsl-rl's own

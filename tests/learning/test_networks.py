@@ -299,7 +299,7 @@ def test_an_optimiser_of_another_kind_is_not_resumed(capsys):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        (["train.algorithm.mirror_loss_coeff=0.5"], "a mirror loss"),
+        (["train.algorithm.mirror_loss_coeff=0.5"], "mirror_loss_coeff is above 0"),
         (["train.algorithm.optimizer=adamw"], "the optimiser is AdamW"),
         (["train.policy.state_dependent_std=true"], "actions are HeteroscedasticGaussianDistribution"),
         (VARIANTS["lstm"], "the actor is a RNNModel"),

@@ -82,7 +82,7 @@ def start_anew(capsys, folder, *arguments: str) -> str:
 
 def test_without_the_state_robots_begin_anew_and_it_is_said(capsys):
     folder = tiny_run("train.runner.save_interval=1", iterations=3)
-    assert "there is no state_0.pt next to it" in start_anew(capsys, folder, "--checkpoint", "0", "--max_iterations", "2")
+    assert "no state_0.pt next to the checkpoint" in start_anew(capsys, folder, "--checkpoint", "0", "--max_iterations", "2")
     assert "there is no state_1.pt" in start_anew(capsys, folder, "--checkpoint", "1", "--max_iterations", "3")
     (folder / "state_2.pt").rename(folder / "state_1.pt")
     assert "state_1.pt belongs to another checkpoint" in start_anew(capsys, folder, "--checkpoint", "1")
@@ -115,7 +115,7 @@ def test_robots_that_begin_anew_stand_on_their_tiles_and_nobody_is_promoted():
     torch.save(saved, folder / "model_1.pt")
     task = make_task(run_config(folder))
     runner = Runner(task)
-    assert runner.resume(str(folder / "model_1.pt")) == "there is no state_1.pt next to it"
+    assert runner.resume(str(folder / "model_1.pt")) == "there is no state_1.pt next to the checkpoint"
     assert task.terrain_curriculum.levels.tolist() == levels.tolist()
     away = (task.base_pos[:, :2] - task.env_origins[:, :2]).norm(dim=1)
     assert away.max() <= task.cfg.terrain.spawn_range * 2**0.5 + 1e-5

@@ -281,7 +281,7 @@ def test_what_a_teacher_knows_of_the_randomisation_must_be_on_its_scale(capsys):
 def test_a_policy_with_an_estimator_is_no_teacher(capsys):
     folder = tiny_run("--task", TASK, "train.policy.estimator.targets=[base_lin_vel]", iterations=1)
     assert call(train.main, [*STUDENT, "--teacher", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]) == 2
-    assert "has an estimator, which a teacher can't have" in capsys.readouterr().err
+    assert "has an estimator; a teacher can't have one" in capsys.readouterr().err
 
 
 def test_observations_that_a_students_task_has_not_are_named(capsys):
@@ -296,7 +296,7 @@ def test_flags_that_do_not_go_together_are_refused(capsys):
     assert call(train.main, ["--task", TASK, "--teacher", TASK, *small]) == 2
     assert f"--teacher: '{TASK}' learns from rewards" in capsys.readouterr().err
     assert call(train.main, [*STUDENT, "--transfer", TASK, *small]) == 2
-    assert "--transfer: 'anymal_c_student' learns from a teacher, and begins anew" in capsys.readouterr().err
+    assert "--transfer: 'anymal_c_student' learns from a teacher, and can't begin with a policy" in capsys.readouterr().err
     assert call(train.main, [*STUDENT, "--teacher", "", *small]) == 2
     assert "error: --teacher: 'anymal_c_student' learns from a teacher; name one" in capsys.readouterr().err
     folder = student()

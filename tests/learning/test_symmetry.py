@@ -245,7 +245,7 @@ class Sideless(LeggedRobot):
 @pytest.mark.slow
 def test_a_task_without_mirror_images_learns_without_symmetry_only():
     task = Sideless(small_config(SYMMETRIC))
-    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images; must be false"):
+    with pytest.raises(ConfigError, match=r"train\.algorithm\.symmetry: Sideless has no mirror images, so this must be"):
         Runner(task)
     Runner(Sideless(small_config(("train.algorithm.symmetry", False))))
 

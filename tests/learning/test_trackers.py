@@ -131,7 +131,7 @@ def test_a_writer_of_one_s_own_stands_beside_tensorboard():
 def test_a_tracker_that_fails_ends_nothing_and_is_told_of_once(capsys):
     assert train.main([*ARGUMENTS, own_tracker(fails_at=1), "--max_iterations", "4"]) == 0
     (folder,) = run_folders()
-    assert capsys.readouterr().err == "warning: the tracker has failed and is left out: the line is dead\n"
+    assert capsys.readouterr().err == "warning: the tracker has failed and is no longer used: the line is dead\n"
     assert scalars(folder)["Perf/total_fps"] == [0, 1, 2, 3]
     lines = Path("lines.txt").read_text().splitlines()
     assert lines[-1] == "scalar Perf/total_fps 1"

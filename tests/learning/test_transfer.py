@@ -146,12 +146,12 @@ def test_a_fixed_learning_rate_is_the_configurations(capsys):
 
 def test_an_optimiser_of_another_kind_begins_anew(capsys):
     source = tiny_run("train.algorithm.optimizer=rmsprop")
-    assert "no state of Adam (it trained with RMSprop)" in said(capsys, str(source))
+    assert "no state of Adam (the checkpoint's optimiser is RMSprop)" in said(capsys, str(source))
     saved = content(source, 1)
     del saved["optimizer_state_dict"]
     torch.save(saved, source / "model_1.pt")
     out = said(capsys, str(source), "train.algorithm.optimizer=rmsprop")
-    assert "no state of RMSprop (it holds none)" in out
+    assert "no state of RMSprop (not in the checkpoint)" in out
 
 
 # ---- which run -------------------------------------------------------------------------------------------------------
@@ -312,7 +312,7 @@ def test_a_policy_alone_is_played_but_not_trained_on(capsys):
     assert "largest difference to the policy" in capsys.readouterr().out
     refused = ["--task", OTHER, "--transfer", str(folder), *TINY_TRAINING, "--sim_device", "cpu"]
     assert call(train.main, refused) == 2
-    assert "holds a policy alone, without a value function; it can be played, not trained on" in capsys.readouterr().err
+    assert "holds a policy without a value function, so a training can't begin with it" in capsys.readouterr().err
     resume = ["--task", TASK, "--resume", "--load_run", str(folder), *TINY_TRAINING, "--max_iterations", "9"]
     assert call(train.main, [*resume, "--sim_device", "cpu"]) == 2
     assert "holds no optimiser, so its training can't be resumed" in capsys.readouterr().err
