@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 ALONG = 0.7
-"""Least y component, in the base's frame, of the axis of a joint that swings a leg forward: at most 45 degrees from y."""
+"""Least |y|, base frame, of the unit axis of a joint that swings a leg forward: the axis is within 45 degrees of y."""
 
 
 def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
@@ -40,7 +40,7 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
 
 
 def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float:
-    """Return the height of the base above the lowest collision shape at `qpos` (nq,), in which the base is level [m]."""
+    """Return the height [m] of a level base above the lowest point of all collision shapes at `qpos` (nq,)."""
     data = stance(model, qpos)
     shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))

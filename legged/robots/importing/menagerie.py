@@ -8,7 +8,7 @@ PREFIX = "menagerie:"
 
 
 def menagerie_model(name: str) -> tuple[Path, str]:
-    """Return the MJCF file of the robot `name`, without a scene, and its licence.
+    """Return the MJCF file and the licence of the robot `name`. The file contains no scene.
 
     Raises:
         ConfigError: the package is missing, or has no such robot.
