@@ -4,10 +4,9 @@ weight that the joint carries.
 Two inertias matter. With the robot in the air, a joint moves the links behind it against the rest of the robot. With the feet
 on the ground, the same joint moves the base as well.
 
-With P gains, the first inertia has the same natural frequency on all robots, in units of sqrt(g / h) for a robot that stands
-h high. P gains are raised until no joint gives way under the robot's weight. D gains give the geometric mean of the two
-inertias the same damping ratio on all robots. Both gains are limited so that an explicit control law is stable at steps of
-5 ms.
+P gains give the first inertia the natural frequency FREQUENCY sqrt(g / h), where h is the robot's standing height. They are
+raised until no joint gives way under the robot's weight. D gains give the geometric mean of the two inertias the damping
+ratio RATIO. Both gains are limited so that an explicit control law is stable at steps of 5 ms.
 
 For ANYmal C and Go2 the rule gives the makers' P gains within a factor of two. Its D gains are 0.7 to 2.4 times the makers'
 for ANYmal C, and 1.9 to 3.7 times for Go2.
@@ -25,14 +24,14 @@ RATIO = 0.5
 SAG = 0.25
 """Largest deflection of a joint under the robot's weight [rad]."""
 SHIFT = 0.1
-"""Least P gain of a leg's joint, divided by m g h [1/rad]; with less, an ankle could not shift the robot's weight."""
+"""Least P gain of a leg's joint, as a share of mass * g * h [1/rad]. With less, an ankle could not shift the weight."""
 LARGEST_TARGET = 0.3
 """P gains are limited so that only targets at least this far from the joint's angle demand the whole torque [rad]."""
 TIME_STEP = 0.005
 """Physics step in which an explicit control law has to be stable [s]."""
 MARGIN = 1.0
-"""Largest eigenvalue of TIME_STEP M^-1 D and TIME_STEP^2 M^-1 K, for inertia M, D gains D and P gains K. From 2 on, an
-explicit law may diverge."""
+"""Largest eigenvalue allowed for TIME_STEP M^-1 D and TIME_STEP^2 M^-1 K, with inertia M, D gains D and P gains K. From 2 on,
+an explicit law may diverge."""
 
 VELOCITY_LIMIT = 30.0
 """Largest joint speed of a robot whose file states none [rad/s]. It is typical of the geared motors of legged robots."""
@@ -52,8 +51,8 @@ def gains(
     `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the motors'
     torque limits [N m], and `height` the base's height above the ground [m]. `rolling` (D,) holds the largest speed of each
     wheel [rad/s], and 0 for other joints. A wheel's stiffness is a gain on its speed [N m s/rad], and its damping is 0. An
-    error of the largest speed demands the whole torque. The gain is smaller if the explicit law would not be stable in the
-    air with it.
+    error as large as the largest speed demands the whole torque. The gain is smaller if the explicit law would otherwise be
+    unstable in the air.
     """
     data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
@@ -67,7 +66,7 @@ def gains(
     leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
     least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
     stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
-    # By Gershgorin's theorem, no eigenvalue of TIME_STEP^2 M^-1 K exceeds MARGIN then. This lowers the gains of light toes.
+    # This limit keeps all eigenvalues of TIME_STEP^2 M^-1 K within MARGIN (Gershgorin). It lowers the gains of light toes.
     stiffness = np.minimum(stiffness, MARGIN / (TIME_STEP**2 * np.abs(inverse[np.ix_(dofs, dofs)]).sum(axis=0)))
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)

@@ -79,7 +79,7 @@ def _joint_partners(
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
-    """Return for each row of `places` the index of the nearest row of `reflected`; None if it is farther than APART."""
+    """Return for each row of `places` the index of the nearest row of `reflected`; None if any is farther than APART."""
     distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
     if distance.size == 0 or (distance.min(axis=1) > APART).any():
         return None

@@ -39,11 +39,11 @@ class RobotFile:
     default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
     feet: tuple[str, ...] = field(metadata=NAMES)
-    """Patterns of the shapes of the feet; all shapes of one body are one foot."""
+    """Patterns of the feet's shapes. All of these shapes on one body form one foot."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; an empty table leaves the gains to a rule by inertia and weight (gains.py)."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the same rule."""
+    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the rule in gains.py."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest joint speed [rad/s]; an empty table means 30 for all joints."""
     penalize_contacts_on: tuple[str, ...] = ()
@@ -234,7 +234,7 @@ def _folder(name: str, where: str) -> Path:
     robots = data_folder("resources") / "robots"
     known = suggest(name, [p.parent.name for p in robots.glob("*/robot.yaml")])
     if not name:
-        raise ConfigError(f"{where}: no robot is named{known}")
+        raise ConfigError(f"{where}: the name of the robot is empty{known}")
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()

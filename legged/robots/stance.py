@@ -47,7 +47,7 @@ def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float
 
 
 def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return flags (D,) of those hinges `joints` (ids) that swing a leg forward and back: hip pitch, knee and ankle pitch.
+    """Return (D,) True for each of the hinges `joints` (ids) that swings a leg forward and back: at hip, knee and ankle.
 
     Each of these hinges lies between the base and one of the shapes `feet` (ids), and its axis points sideways in the pose
     `qpos`, in which the base is level.

@@ -124,7 +124,7 @@ def test_gains_may_be_given_and_joints_held(added):
     robot = load_robot("mine/fourth_toy")
     assert (robot.num_dof, robot.mass) == (12, pytest.approx(14.0))
     assert set(robot.stiffness) == {40.0}
-    assert "joints that --hold names are held: arm at 1 rad" in out
+    assert "joints are held because of --hold: arm at 1 rad" in out
 
 
 @pytest.mark.slow

@@ -101,7 +101,7 @@ def take_gains(
     if grows > 1.0:
         tree.say(
             f"gains of the file's position actuators are left out: at steps of {TIME_STEP * 1000:g} ms an explicit law with"
-            f" them makes deviations grow by {grows:.3g} a step"
+            f" them makes deviations {grows:.3g} times as large in each step"
         )
         return {}, {}
     sags = _sags(tree, angles, stiffness, feet)
@@ -135,7 +135,7 @@ def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], fee
 
 def growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
     """Return the largest factor by which a deviation from the pose at `angles` [rad] grows in one step of semi-implicit Euler
-    with explicit torques -K q - D v and a free base. K of a wheel acts on its speed. A joint without D has its own damping.
+    with explicit torques -K q - D v and a free base. K of a wheel acts on its speed. The joint's damping counts if D is 0.
     """
     rolls = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and hinge.rolls}
     stiffness, damping = stiffness | dict.fromkeys(rolls, 0.0), damping | rolls

@@ -84,7 +84,7 @@ def is_plain_file(path: Path) -> bool:
 
 
 def is_plain(spec: mujoco.MjSpec) -> bool:
-    """Return True if a spec is a robot alone that meets the engines' conditions: one body with a free joint on the world,
+    """Return True if a spec holds only a robot that meets the engines' conditions: one body with a free joint on the world,
     named joints below it, motors of hinges in the order of the hinges, and named collision shapes without meshes.
     """
     world = spec.worldbody

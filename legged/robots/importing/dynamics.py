@@ -16,7 +16,7 @@ from legged.robots.importing.tree import Tree
 POSES = 8
 """Number of poses in which lost torques are computed."""
 SHARE = 0.1
-"""Largest torque that may be left out, as a share of the torque limit; for the base, force as a share of the weight."""
+"""Largest share of a joint's torque limit, or of the robot's weight on the base, that may be left out."""
 LEVER = 0.1
 """Lever arm [m]. The robot's weight times this length stands in for the torque limit of joints without one."""
 ARRAYS = (
@@ -26,7 +26,7 @@ ARRAYS = (
     ("gravity compensation is left out", "body", "gravcomp"),
     ("properties of actuators are left out", "actuator", "damping armature delay"),
 )
-"""Line for the user, kind of element, and names of its properties: arrays of MuJoCo's model, 0 for elements without them."""
+"""Line for the user, kind of element, and properties: arrays of MuJoCo's model that hold 0 for elements without them."""
 UNEVEN = "torque limits that differ by direction become the smaller one"
 FILTERS = "filters and states of actuators are left out; control.actuator.delay can stand in for them"
 LAWS = "actuators other than motors, position servos and velocity servos become motors with the task's control law"
@@ -107,6 +107,6 @@ def _lost_torque(model: mujoco.MjModel, tree: Tree) -> tuple[str, float, float]:
 
 
 def _name(model: mujoco.MjModel, kind: str, i: int) -> str:
-    """Return the name of an element; for a degree of freedom that of its joint."""
+    """Return the name of an element; a degree of freedom has the name of its joint."""
     number, of = (int(model.dof_jntid[i]), "jnt") if kind == "dof" else (int(i), kind)
     return getattr(model, of)(number).name or f"{of} {number}"

@@ -29,7 +29,7 @@ class Guesses:
     angles: dict[str, float]
     """Angles of the driven hinges in the default pose [rad]."""
     angles_from: str
-    """Source of the angles, for a comment."""
+    """Source of these angles, for a comment in robot.yaml."""
     passive: Sequence[str]
     """Hinges without a motor."""
     feet: Sequence[str]
@@ -52,7 +52,7 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
     """Write model, meshes, robot.yaml and PROVENANCE.md; return the size of the meshes [MiB].
 
     Raises:
-        ConfigError: a file is in place of the folder.
+        ConfigError: `folder` is a file.
         RunError: the folder can't be written.
     """
     make_folder(folder)
@@ -141,7 +141,7 @@ def _compact(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _name(text: str) -> str:
-    """Return a text as YAML, quoted if it would not be read as text otherwise."""
+    """Return a text as YAML, in quotes if YAML would read it as something else."""
     if "\n" in text:
         return json.dumps(text)
     return dump([text], default_flow_style=True, width=10_000, allow_unicode=True).strip()[1:-1]

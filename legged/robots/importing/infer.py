@@ -124,7 +124,7 @@ def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
     for leg in legs:
         for hinge in (hinge for hinge in tree.links[leg.end].hinges if hinge.rolls and hinge.driven):
             found[hinge.name] = float(f"{0.5 * np.sqrt(GRAVITY * height) / max(s.size[0] for s in leg.feet):.2g}")
-            tree.say("guess: hinges that turn wheels; their actions are speeds, and their angles not observed", hinge.name)
+            tree.say("guess: hinges that turn wheels (actions are speeds, and angles are not observed)", hinge.name)
     return found
 
 
@@ -148,8 +148,8 @@ def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool
 
 
 def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float) -> set[str]:
-    """Return the names of the shapes that belong to feet, whether they touch the ground or not. They are all collision shapes
-    of the foot's link in the file, if it was welded to the leg's last link or if the last hinge is an ankle: near the ground
+    """Return the names of all shapes of feet, including those that do not touch the ground. A foot is the link of the file
+    that touches the ground, if it was merged into the leg's last link, or if the hinge of the last link is near the ground
     in the pose at `angles` [rad], with the base at `height` [m].
     """
     poser = Poser(tree)
@@ -189,7 +189,7 @@ def _name_passive(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
-    """Rename those shapes `role` whose names are part of the name of a shape outside `role`; return the names of `role`."""
+    """Rename the shapes `role` (names) whose name is part of the name of a shape not in `role`; return the new `role`."""
     named = {shape.name: shape for shape in tree.shapes}
     shapes = [named[name] for name in role]
     for shape in shapes:
@@ -202,8 +202,8 @@ def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
 
 
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
-    """Return patterns that match exactly the shapes `names`: a word that all their names and no others contain, else their
-    names, of which none may be part of another shape's name.
+    """Return patterns that match exactly the shapes `names`: one word if it is in all their names and in no others, else
+    their names. None of `names` may be part of another shape's name.
     """
     others = [shape.name for shape in tree.shapes if shape.name not in names]
     for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
@@ -224,7 +224,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str], of_feet: set[str]) 
     because the robot stands on them.
     """
     of_legs = {i for leg in legs for i in leg.links}
-    # the second-last link of a leg: it has the heel if the leg ends in a toe
+    # If a leg ends in a toe, its second-last link has the heel.
     before = {i for leg in legs for i in leg.links[-2:-1]}
     soles = {shape.name for i in before for shape in tree.links[i].shapes if SOLE.search(f"{shape.link} {shape.name}")}
     in_the_middle = _trunk(tree, legs)
@@ -301,6 +301,6 @@ def _check_mass(tree: Tree) -> None:
     mass = float(model_of(tree).body_mass.sum())
     if abs(mass - tree.mass) > LOST * max(1.0, tree.mass):
         raise ConfigError(
-            f"{tree.source}: its links weigh {tree.mass:.6g} kg, but the model weighs {mass:.6g} kg: the import lost mass"
+            f"{tree.source}: the links weigh {tree.mass:.6g} kg, but the model weighs {mass:.6g} kg: the import lost mass"
         )
     tree.say(f"mass: {tree.mass:.9g} kg in the links of the file, {mass:.9g} kg in the model")

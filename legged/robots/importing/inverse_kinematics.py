@@ -23,7 +23,7 @@ STEP = 1e-5
 GOOD = 0.05
 """Largest distance of a foot from its goal, as a share of the leg's length."""
 KNEES = 0.002
-"""Weight of knees on the wrong side in the cost. It is small: it only decides between poses that are otherwise as good."""
+"""Weight, in the cost, of knees on the wrong side of the hip. It is so small that it decides only between similar costs."""
 LATERAL = 0.7
 """Least absolute y component of the axis of a hinge that bends a leg forward."""
 
@@ -37,7 +37,7 @@ class _Limb:
     signs: Vector
     """(hinges,) signs, 1 or -1, with which the partner takes the leg's angles."""
     ranges: Vector
-    """(hinges, 2) ranges of the leg's angles [rad]; with `signs` they are within the partner's ranges too."""
+    """(hinges, 2) ranges of the leg's angles [rad]. Times `signs`, they are within the partner's ranges too."""
     hip_name: str
     """First hinge that bends the leg forward."""
     hip: Vector
@@ -133,7 +133,7 @@ def _solved(errors: Callable[[Vector], Vector], x: Vector, lows: Vector, highs: 
 
 
 def _wrong_knees(poser: Poser, limbs: list[_Limb], forward: bool) -> float:
-    """Return a cost for knees on the wrong side of the hip, which is behind it if `forward`, else in front of it."""
+    """Return a cost for knees on the wrong side: behind the hip if knees should point `forward`, else in front of it."""
     cost = 0.0
     for limb in limbs:
         body = poser.ids[limb.knee]

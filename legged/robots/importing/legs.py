@@ -116,7 +116,8 @@ def side_of(name: str) -> int:
 
 
 def find_legs(tree: Tree) -> list[Leg]:
-    """Return the legs, in the order of the file: the chains whose ends reach lowest, among those with names of legs, if any.
+    """Return the legs, in the order of the file: the chains whose ends reach lowest. Names of feet,
+    arms and heads tell which chains are considered.
 
     Raises:
         ConfigError: no chain, or only one, reaches below the base.
@@ -196,7 +197,7 @@ def _ends(shape: Shape) -> list[Vector]:
 
 
 def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
-    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A ball is added to a rod."""
+    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A rod gets a ball."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
     if any(hinge.rolls for hinge in link.hinges):
@@ -219,8 +220,8 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
 
 
 def _uncover(tree: Tree, leg: Leg) -> None:
-    """Shorten the shape of a shank if it encloses the foot, a ball, because its mesh did. The foot then touches the ground
-    first. The shape ends above the centre of the foot, by half of the shape's width, so that the leg can lean by 45 degrees.
+    """Shorten a shape that was fitted to one mesh of shank and foot, so that the foot, a ball, touches the ground first. The
+    shape then ends half its width above the centre of the foot, so that the leg can lean by 45 degrees.
     """
     if len(leg.feet) != 1 or leg.feet[0].kind != "sphere":
         return

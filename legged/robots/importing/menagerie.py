@@ -27,5 +27,5 @@ def menagerie_model(name: str) -> tuple[Path, str]:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise RunError(f"{PREFIX}{name}: {' '.join(str(error).split())}") from error
     if not path.is_file():
-        raise RunError(f"{PREFIX}{name}: {path} is missing; a download may have been cut off (python -m mujoco_menagerie)")
+        raise RunError(f"{PREFIX}{name}: {path} is missing; check downloads: python -m mujoco_menagerie verify")
     return path, robot.license

@@ -18,7 +18,7 @@ from legged.robots.importing.tree import Mesh, Shape, Vector, quat_product, rota
 READ = (".stl", ".obj", ".msh")
 """Suffixes of files that MuJoCo reads."""
 MOST_FACES = 200_000
-"""Largest number of faces of an STL file that MuJoCo's decoder takes."""
+"""Largest number of faces that MuJoCo accepts in an STL file."""
 ENOUGH_FACES = 50_000
 """Largest number of faces of a mesh that was simplified because it had too many."""
 FINEST = 600
@@ -198,7 +198,7 @@ def check_length(source: Path, shape: Shape, points: Vector | None) -> None:
     if length > LONGEST:
         name = shape.mesh.file.name if shape.mesh is not None and shape.mesh.file is not None else shape.name
         raise ConfigError(
-            f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; one in millimetres needs"
+            f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; if it is in millimetres, add"
             ' scale="0.001 0.001 0.001"'
         )
 

@@ -215,7 +215,7 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
             continue
         dof, drawn_at = int(model.jnt_dofadr[i]), float(model.qpos0[model.jnt_qposadr[i]])
         hinge = Hinge(name, model.jnt_axis[i].copy(), model.jnt_pos[i].copy(), driven=False)
-        if drawn_at:  # the file shows a joint with a `ref` at that angle
+        if drawn_at:  # in the file's pose, the joint is at this angle (`ref`)
             turn_link(link, hinge, -drawn_at)
         if model.jnt_limited[i]:
             hinge.range = (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1]))
@@ -325,7 +325,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
             anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                turned = [  # anchors on the base are given in its turned frame
+                turned = [  # the frame of the base was turned, and so are the anchors in it
                     rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
                     for body, name, anchor in zip(bodies, names, anchors, strict=True)
                 ]

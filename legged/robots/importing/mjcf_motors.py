@@ -21,7 +21,7 @@ def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
         if mujoco.mjtTrn(int(model.actuator_trntype[i])) in ON_JOINTS:
             name = model.joint(joint).name or f"{model.body(model.jnt_bodyid[joint]).name}_joint"
         if name not in hinges:
-            tree.say("actuators that do not drive one hinge are left out", model.actuator(i).name or str(i))
+            tree.say("actuators that drive something other than one hinge are left out", model.actuator(i).name or str(i))
             continue
         _read_actuator(model, i, hinges[name])
     if not any(hinge.driven for hinge in hinges.values()):

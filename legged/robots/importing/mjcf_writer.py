@@ -88,13 +88,13 @@ def _touched_colour(group: int) -> str:
 
 def _mesh(mesh: Mesh, file: Path) -> str:
     scale = "" if mesh.file is None or np.allclose(mesh.scale, 1.0) else f' scale="{numbers(mesh.scale)}"'
-    # With inertia="shell", MuJoCo accepts meshes without a volume. It has no other effect: visual meshes have no mass.
+    # inertia="shell" makes MuJoCo accept meshes without a volume. It changes no masses, as visual meshes have none.
     return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
 
 
 def _loop_ends(tree: Tree) -> dict[str, list[tuple[str, str]]]:
-    """Return link -> sites (name, position) of the constraints that need sites. MuJoCo finds the second point of a constraint
-    where the first one is at zero joint angles. If the two points are apart there, the constraint needs a site on each link.
+    """Return link -> sites (name, position) of the constraints that need sites. MuJoCo assumes that the two points of a
+    constraint coincide at zero joint angles. If they do not, the constraint needs a site on each link.
     """
     places: list[tuple[Vector, Vector]] = []
     for link in tree.links:

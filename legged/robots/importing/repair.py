@@ -73,7 +73,7 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
         for hinge in [hinge for hinge in link.hinges if any(pattern in hinge.name for pattern in hold)]:
             angle = rest_angle(tree, hinge)
             fix(link, hinge, angle)
-            tree.say("joints that --hold names are held", f"{hinge.name} at {angle:.3g} rad")
+            tree.say("joints are held because of --hold", f"{hinge.name} at {angle:.3g} rad")
 
 
 def fix(link: Link, hinge: Hinge, angle: float) -> None:
@@ -104,7 +104,7 @@ def _hold_what_is_light(tree: Tree, light: float, at: Mapping[str, float]) -> No
 
 
 def _hold_followers(tree: Tree, at: Mapping[str, float]) -> None:
-    """Hold hinges without a motor that follow a held hinge, at the angles `at` [rad], because nothing moves them."""
+    """Hold hinges without a motor if the hinge that they follow is held. They stay at the angles `at` [rad]."""
     names = {hinge.name for hinge in tree.hinges}
     coupled = [loop for loop in tree.loops if loop["tag"] == "joint" and "joint2" in loop]
     followers = {loop["joint1"] for loop in coupled if loop["joint2"] not in names}

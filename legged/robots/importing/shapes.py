@@ -64,9 +64,9 @@ def give_trunk(tree: Tree, widest: float) -> None:
 
 
 def name_shapes(tree: Tree) -> None:
-    """Give each collision shape a unique name, its own or its link's, that the scene does not need."""
+    """Give each collision shape a unique name that the scene does not need: its own name, else the name of its link."""
     taken: set[str] = set()
-    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # shapes with names come first, so that they keep them
+    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # named shapes come first and keep their names
     for shape in shapes:
         wanted = re.sub(r"[\s/]+", "_", shape.name or shape.link) or "shape"
         if re.fullmatch(RESERVED["geom"], wanted):

@@ -123,7 +123,7 @@ class Tree:
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
-        """Record a line for the user. Lines with the same text become one line, which lists `about` of each."""
+        """Record a line for the user. Lines with the same text become one line, which lists all their `about`."""
         names = self._said.setdefault(line, [])
         if about and about not in names:
             names.append(about)
@@ -139,7 +139,7 @@ class Tree:
         self.loops.append({"tag": "joint", "joint1": follower, "joint2": leader, "polycoef": polynomial})
 
     def followed(self, angles: Mapping[str, float]) -> dict[str, float]:
-        """Return joint angles [rad] with those of coupled hinges computed from their leaders' angles."""
+        """Return `angles` [rad] with the angles of coupled hinges computed from those of their leaders."""
         found = dict(angles)
         for loop in self.loops:
             if loop["tag"] == "joint" and "joint2" in loop:
@@ -184,8 +184,8 @@ class Tree:
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. The hinges of the link before
-    that one stay where they are, and their axes and anchors are expressed in the turned frame.
+    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. Earlier hinges
+    of the link stay where they are; their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
     shift, back = hinge.anchor - rotate(turn, hinge.anchor), inverse(turn)

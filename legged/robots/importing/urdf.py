@@ -123,7 +123,7 @@ def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) ->
 
 
 def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
-    """Keep the robot's orientation in the frame of the links above its base, and report that these links are left out."""
+    """Turn the robot as the joints above its base turn it, and report that the links above the base are left out."""
     for joint in reversed(above):
         tree.turn(_origin(joint.element, joint.path)[1])
         if joint.kind == "fixed" and joint.parent != "world":
@@ -152,7 +152,7 @@ def _check_degrees(tree: Tree) -> None:
 
 
 def _say_what_is_unknown(tree: Tree, root: ET.Element) -> None:
-    """Report the elements that are left out, of the robot and of its joints."""
+    """Report the elements of the robot and of its joints that are left out."""
     left_out = [element.tag for element in root if element.tag not in ("link", "joint", "material")]
     left_out += [part.tag for joint in root.findall("joint") for part in joint if part.tag not in PARTS]
     for tag in dict.fromkeys(tag for tag in left_out if isinstance(tag, str)):

@@ -49,7 +49,7 @@ def _across(point: Vector, hinge: Hinge) -> Vector:
 
 
 def _about(shape: Shape, hinge: Hinge) -> Shape | None:
-    """Return a shape in the form that rolls about a hinge's axis; None if the shape is not round about this axis."""
+    """Return the round shape about a hinge's axis that stands for `shape`; None if `shape` is not round about this axis."""
     if shape.points is not None:
         return _cylinder(shape, shape.points, hinge)
     if shape.kind not in ("sphere", "cylinder", "capsule"):
@@ -60,7 +60,7 @@ def _about(shape: Shape, hinge: Hinge) -> Shape | None:
     if shape.kind != "sphere" and along > 0.999:
         return shape
     called = bool(WHEEL.search(f"{shape.link} {shape.name} {hinge.name}"))
-    if shape.kind == "cylinder" and along < 0.001 and called:  # the file's author forgot that cylinders lie along z
+    if shape.kind == "cylinder" and along < 0.001 and called:  # the author may have forgotten that cylinders lie along z
         return replace(shape, quat=_along(hinge))
     return shape if shape.kind == "sphere" and called else None
 
