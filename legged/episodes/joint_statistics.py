@@ -38,7 +38,7 @@ class JointStatistics:
     units: dict[str, list[str]]
     mean: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
-    """Name of a recorded array -> (D,) units, means and standard deviations over the steps of all episodes."""
+    """`units`, `mean` and `std` map names of recorded arrays to (D,) values. Steps of all episodes count alike."""
     episodes: int
     """Number of episodes longer than `SETTLE_S`."""
     steps: int

@@ -130,7 +130,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
-        # Episodes are as long as in the training.
+        # The override of the episode length is left out: episodes are as long as in the training.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
         if playground is not None:
             own += [*SETTING, *playground.changes(cfg)]

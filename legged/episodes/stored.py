@@ -31,9 +31,9 @@ FORMAT = 1
 """Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
 """Arrays with a row for each episode. `episode_start` is its first row in the other arrays; one more entry is their number of
-rows. `robot` ran it. `failed` and `timed_out` flag an end by a failure, and by time or a term that is no failure. `ended_by`
-has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before its first step. The other arrays
-have a row for each control step, one episode after another.
+rows. `robot` is the one that ran the episode. `failed` and `timed_out` flag an end by a failure, and by time or a term that
+is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before the first
+step. The other arrays have a row for each control step, one episode after another.
 """
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 JOINTS = ("joint_pos", "joint_vel", "torque")

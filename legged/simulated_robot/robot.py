@@ -182,7 +182,7 @@ class SimulatedRobot:
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
     def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
-        """Return the present measurements and the requested `sources`: name -> points (P, 2) [m] of `heights`, else None."""
+        """Return the present measurements and the requested `sources`. The value of `heights` is its points (P, 2) [m]."""
         data = self.data
         return Reading(
             time=float(data.time),

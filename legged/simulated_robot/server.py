@@ -121,7 +121,7 @@ class Server:
                         self._newest = 0
                     self._client = client  # this client receives the states from now on
                     self._socket.sendto(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)), client)
-            elif client == self._client and kind == udp.BYE:  # it is never lost, so that the simulation ends
+            elif client == self._client and kind == udp.BYE:  # a goodbye is never lost, so the simulation ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
                 self._in.put(now, (sequence, body))
