@@ -25,36 +25,36 @@ PHASES = 50
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 0.1, 2.0
 """Limits of a gait cycle's length [s]. A shorter one is a bounce of the foot, and a longer one contains a stop."""
 UNUSUAL = 0.5
-"""Largest relative deviation of a cycle's length from the median. Other cycles, stops and stumbles, are left out."""
+"""Largest relative deviation of a cycle's length from the median. Cycles that deviate more, as in stumbles, are left out."""
 MEASURED = (("joint_pos", "angle"), ("joint_vel", "velocity"), ("torque", "torque"))
 """Names and titles of the recorded arrays whose statistics are computed."""
 
 
 @dataclass(frozen=True)
 class JointStatistics:
-    """Statistics of D joints over those steps of some episodes that come after `SETTLE_S`."""
+    """Statistics of D joints over some episodes, without the first `SETTLE_S` of each episode."""
 
     joints: list[str]
     units: dict[str, list[str]]
     mean: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
-    """Units, means and standard deviations over the steps of all episodes, each as array -> (D,)."""
+    """`units`, `mean` and `std` map names of recorded arrays to (D,) values. Steps of all episodes count alike."""
     episodes: int
     """Number of episodes longer than `SETTLE_S`."""
     steps: int
     lost: int
     """Number of steps that are left out because they hold numbers that are not finite."""
     cycles: dict[str, np.ndarray]
-    """Array -> (C, PHASES, D) values over the phase of each of C cycles, from one touch-down to the next."""
+    """Name of a recorded array -> (C, PHASES, D) values over the phase of C cycles, from one touch-down to the next."""
     cycle_s: np.ndarray
     """(C,) length of each cycle [s]."""
     duty: dict[str, float]
-    """Foot -> share of the cycles' steps at whose end the foot has contact, like the duty factor of an evaluation. The first
-    foot is the one whose touch-downs delimit cycles. In `feet_contact`, each contact lasts a step longer.
+    """Foot -> share of the cycles' steps at whose end the foot has contact, like the duty factor of an evaluation. Cycles are
+    delimited by touch-downs of the first foot. (In the array `feet_contact`, each contact lasts a step longer.)
     """
 
     def over_cycle(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation of an array over the cycles, (PHASES, D) each."""
+        """Return the mean and the standard deviation of the array `name` over the cycles, (PHASES, D) each."""
         return self.cycles[name].mean(axis=0), self.cycles[name].std(axis=0)
 
 
@@ -63,14 +63,14 @@ def joint_statistics(episodes: Episodes) -> JointStatistics:
 
     A cycle lasts from a touch-down of the first foot to its next one, within the limits `SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`
     and `UNUSUAL`. Its values are interpolated linearly at `PHASES` points. Steps with numbers that are not finite are left
-    out, and so are their cycles.
+    out, and so are the cycles with these steps.
 
     Raises:
         ConfigError: the task has no joints with motors, or no episode is long enough.
     """
     joints, feet, task = episodes.about["joints"], list(episodes.about.get("feet", [])), episodes.about["task"]
     if not joints:
-        raise ConfigError(f"POLICY: '{task}' has no joints with a motor each")
+        raise ConfigError(f"POLICY: '{task}' has no motors that drive one joint each")
     names = [name for name, _ in MEASURED if name in episodes]
     settled = round(SETTLE_S / episodes.dt)
     chosen = np.flatnonzero(episodes.lengths > settled).tolist()
@@ -107,7 +107,7 @@ def joint_statistics(episodes: Episodes) -> JointStatistics:
 
 
 def cycles_of(contact: np.ndarray, dt: float) -> list[tuple[int, int]]:
-    """Return (first step, first step of the next cycle) for every gait cycle, from the contacts (T,) of a foot."""
+    """Return (first step, first step of the next cycle) for every gait cycle in the contacts (T,) of a foot."""
     down = contact > 0.5
     touched = np.flatnonzero(down[1:] & ~down[:-1]) + 1
     pairs = [(int(begin), int(end)) for begin, end in pairwise(touched)]
@@ -126,7 +126,7 @@ def resampled(values: np.ndarray, begin: int, end: int) -> np.ndarray:
 
 
 def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None:
-    """Write statistics, label of a policy -> statistics, into `folder` as Markdown, HTML and PNG.
+    """Write statistics into `folder` as Markdown, HTML and PNG. `found` maps labels of policies to their statistics.
 
     Raises:
         RunError: a file can't be written.
@@ -143,8 +143,8 @@ def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None
 
 
 def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
-    """Return title -> table, one table for each quantity with one line for each joint: mean and standard deviation of each
-    policy and, for two policies, the difference of the means. If there are gait cycles, the last table describes them.
+    """Return title -> table. Each quantity has a table with a line for each joint, which gives the mean and the standard
+    deviation of each policy and, for two policies, the difference of the means. The last table describes gait cycles, if any.
 
     Raises:
         ConfigError: the joints of two policies differ.

@@ -1,4 +1,4 @@
-"""The page of an episode: one HTML file that holds its film, plots, numbers and the script that draws them. For the film,
+"""The page of an episode: one HTML file with a film, numbers, plots, and the script that draws the plots. For the film,
 recorded states are written into a task with one robot and drawn as in `play`. If nothing can be rendered, the page draws the
 positions of the bodies as a stick figure.
 """
@@ -38,10 +38,10 @@ picture."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)
 """JPEG qualities. The first one with which all pictures of an episode fit into BUDGET_MB is taken."""
 BUDGET_MB = 3.0
-"""Largest size of all pictures of a page, to which base64 adds a third [MB]."""
+"""Largest total size of the pictures of a page before base64 coding, which adds a third [MB]."""
 OTHERS = "#BBBBBB"
 MOST_PARTS = 7
-"""Number of the largest reward parts, which have their own colours; the other parts are summed."""
+"""Number of reward parts with their own colours. They are the largest ones; the other parts are summed."""
 MOST_LINES = 8
 """Largest number of lines of a plot."""
 LEG = re.compile(r"(?i)[lr]|[lr][fh]|[bfhmr][lr]|left|right|front|rear|hind|back")
@@ -116,10 +116,10 @@ class Projector:
         model = self.task.physics.model
         for name, width in (("qpos", model.nq), ("qvel", model.nv)):
             if episodes[name].shape[1] != width:
-                raise ConfigError(f"{cfg.task}: its model has changed: {name} has {width} numbers, unlike the episodes")
+                raise ConfigError(f"{cfg.task}: its model has changed since the recording: {name} now has {width} numbers")
 
     def show(self, number: int) -> dict[str, Any]:
-        """Return the film of an episode for its page: `pictures` as JPEG in base64, one after `every` steps. If nothing can
+        """Return the film of an episode for its page: `pictures` as JPEG in base64, one for `every` steps. If nothing can
         be rendered, return the reason `why`, the `parents` of B bodies, and their `places` (T', B, 3), world frame [m].
         """
         steps = int(self.episodes.lengths[number])
@@ -183,7 +183,7 @@ class Panels:
     def __init__(self, episodes: Episodes, number: int) -> None:
         self.episodes, self.one, self.joints = episodes, episodes.of(number), episodes.about["joints"]
         self.arrays: dict[str, np.ndarray] = {}
-        """Array -> (T, K) values."""
+        """Name of an array -> (T, K) values."""
 
     def sections(self) -> list[dict[str, Any]]:
         """Return the sections of the page in order (see `_section`). If the task multiplies rewards by the control step,
@@ -255,12 +255,12 @@ class Panels:
     # ---- all tasks --------------------------------------------------------------------------------------------------
 
     def _lines(self, series: str, labels: Sequence[str], columns: Sequence[int] | None = None) -> list[dict[str, Any]]:
-        """Return lines of the given columns of a series, by default of all columns. `labels` are those of all columns."""
+        """Return the lines of `columns` of a series, by default of all columns; `labels` has a label for every column."""
         chosen = range(len(labels)) if columns is None else columns
         return [_line(labels[i], series, i, COLORS[k % len(COLORS)]) for k, i in enumerate(chosen)]
 
     def _undriven(self, array: str, series: str, title: str, unit: str, first: int = 0) -> list[dict[str, Any]]:
-        """Return plots, with at most MOST_LINES lines each, of coordinates without a motor, from column `first` on."""
+        """Return plots of the coordinates without a motor from column `first` on. Each plot has at most MOST_LINES lines."""
         names, driven = self.episodes.columns(array), {joint[array] for joint in self.joints}
         columns = [i for i in range(first, len(names)) if i not in driven]
         if columns:

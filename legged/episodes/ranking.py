@@ -1,4 +1,4 @@
-"""Figures of each episode, and the order of episodes by one of the figures."""
+"""Key figures of each episode, such as its length and return, and the order of episodes by one of these figures."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -31,7 +31,7 @@ class Figures:
     """The figures of E episodes."""
 
     values: dict[str, np.ndarray]
-    """Name in COLUMNS -> (E,) figures, in that order; figures that the task lacks are left out."""
+    """Name in COLUMNS -> (E,) figures, in the order of COLUMNS. Figures that the task lacks are left out."""
     strained: list[str]
     """For each episode, the joint that came closest to its torque limit; empty if no joint has a limit."""
     failed: np.ndarray
@@ -39,7 +39,7 @@ class Figures:
     ended: list[list[str]]
     """Names of the terms that ended each episode."""
     ends: list[str]
-    """Names of all terms that can end an episode, and of ends without a term."""
+    """Names of all terms that can end an episode, followed by TIME_UP and NO_NUMBERS."""
 
 
 def figures_of(episodes: Episodes) -> Figures:
@@ -98,7 +98,7 @@ def check_ended(name: str, ends: Sequence[str]) -> None:
         ConfigError: there is no such term.
     """
     if name not in ends:
-        raise ConfigError(f"--ended: {name}: no episode ends by it{suggest(name, ends)}")
+        raise ConfigError(f"--ended: {name}: no such term ends episodes{suggest(name, ends)}")
 
 
 def listing(figures: Figures, numbers: Sequence[int]) -> tuple[list[str], list[list[str]]]:
@@ -113,7 +113,7 @@ def listing(figures: Figures, numbers: Sequence[int]) -> tuple[list[str], list[l
 
 
 def counts_text(figures: Figures) -> str:
-    """Return as text how many episodes there are, how many failed, and how many each term ended."""
+    """Return a text with the number of episodes, of failed ones, and of those that each term ended."""
     counts = Counter(term for terms in figures.ended for term in terms)
     ended = ", ".join(f"{count} by {term}" for term, count in counts.most_common())
     return f"{len(figures.ended)} episodes, {int(figures.failed.sum())} failed; ended: {ended}"

@@ -1,5 +1,5 @@
 """Recordings of a policy's episodes: the task is built again with or without disturbances, and robots run whole episodes. At
-every control step quantities are recorded on the device, from which they are fetched in chunks.
+every control step, quantities are stored on the device. Chunks of many steps are copied from there to the host.
 """
 
 import copy
@@ -48,7 +48,7 @@ class Wish:
     as_trained: bool = False
     """True: noise, pushes, curricula and randomisation are those of the training."""
     command: tuple[float, float, float] | None = None
-    """Command of all robots, vx, vy [m/s], yaw rate [rad/s]; if None, commands are drawn as in the training."""
+    """Command of all robots, vx, vy [m/s], yaw rate [rad/s]; if None, commands are sampled as in the training."""
     terrain: str | None = None
     """Terrain type, as in `play`. If neither type nor difficulty is given, the ground is that of the training."""
     difficulty: float | None = None
@@ -57,10 +57,10 @@ class Wish:
 
 
 def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
-    """Check the choices, and return the playground; None if the task keeps its own ground.
+    """Check that the settings fit the task, and return the playground; None if the task keeps its own ground.
 
     Raises:
-        ConfigError: a choice does not fit the task.
+        ConfigError: a setting does not fit the task.
     """
     if not isinstance(policy.cfg, LeggedConfig) and wish.command is not None:
         raise ConfigError(f"--command: '{policy.cfg.task}' follows no commands")
@@ -68,7 +68,7 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
         if given is not None and not isinstance(policy.cfg, LeggedConfig):
             raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose")
         if given is not None and wish.as_trained:
-            raise ConfigError(f"--{flag}: --as-trained takes the ground of the training; leave one of them out")
+            raise ConfigError(f"--{flag}: --as-trained takes the ground of the training; leave out one of the two")
     wanted = override(policy.cfg, wish.changes)
     if not isinstance(wanted, LeggedConfig) or (wish.terrain is None and wish.difficulty is None):
         return None
@@ -82,7 +82,7 @@ def roll_out(
     that chooses the engine, for error messages.
 
     Raises:
-        ConfigError: a choice does not fit the task, or the checkpoint does not fit.
+        ConfigError: a setting or the checkpoint does not fit the task.
         TermError: the step cannot be captured.
     """
     playground = check_wish(policy, wish)
@@ -130,7 +130,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
-        # Episodes are as long as in the training.
+        # The override of the episode length is left out: episodes are as long as in the training.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
         if playground is not None:
             own += [*SETTING, *playground.changes(cfg)]
@@ -174,7 +174,7 @@ def _about(task: BaseTask) -> dict[str, Any]:
 
 
 class StepRecord:
-    """Record of a step: a row for each robot with all quantities, written as a part of the captured step."""
+    """All quantities of a step, in a row for each robot. The rows are written as a part of the captured step."""
 
     def __init__(self, task: BaseTask) -> None:
         self.quantities = quantities_of(task)
@@ -214,12 +214,12 @@ def record_episodes(
     place: Callable[[], None] | None = None,
     graph: bool = True,
 ) -> tuple[Episodes, int]:
-    """Run `episodes` episodes from a reset to their end. Return them, first the first episode of every robot, then the second
-    ones, and so on; and how often a robot lost contacts in a step for want of memory.
+    """Run `episodes` episodes, each from a reset to its end. Return them in order: all robots' first episodes, their second
+    ones, and so on. Also return how often a robot lost contacts in a step because memory was short.
 
     Robot i contributes its first `shares_of(...)[i]` episodes, long or short. If the episodes that end first were taken
     instead, short ones would be too frequent. All robots hold `command`, vx, vy [m/s] and yaw rate [rad/s], if it is given.
-    `place` is called before the first reset to place robots. With `graph` the step is captured on a GPU.
+    `place` is called before the first reset to place robots. With `graph`, a GPU captures the step as a CUDA graph.
 
     Raises:
         TermError: the step cannot be captured.
@@ -230,7 +230,7 @@ def record_episodes(
     if place is not None:
         place()
     physics, (n, width), shares = task.physics, record.row.shape, shares_of(episodes, task.num_envs)
-    # The state after resets is stored behind the row of a step, because the next episode may begin in it.
+    # Each row holds the quantities of a step and then the state after resets, in which the next episode may begin.
     whole = width + physics.qpos.shape[1] + physics.qvel.shape[1]
     length = max(1, min(LONGEST_CHUNK, int(CHUNK_MB * 2**20 / (4 * n * whole)), task.max_episode_length))
     buffer = torch.zeros(length, n, whole, device=task.device)
@@ -302,7 +302,7 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
             "qvel", lambda: physics.qvel, "m/s, rad/s", "generalised velocities, MuJoCo's layout", _coordinates(model, 1)
         ),
         Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
-        Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; below 0 it may have been cut off"),
+        Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; a negative sum may have been set to 0"),
         Quantity("reward_parts", lambda: rewards.last.t(), "1", "scale times term of this step", rewards.names),
         *(_of_legs(task) if isinstance(task, LeggedRobot) else _of_motors(task)),
         Quantity("ended", ended, "1", "failed, out of time, and by which terms", (*FLAGS, *terms.names)),
@@ -313,9 +313,9 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
     """Return a mapping for each joint with a motor, in the order of the motors, to be written as JSON. The list is empty if a
     motor drives something other than one joint.
 
-    The keys are `name`; `unit` of the position, rad or, for a slide, m; `qpos` and `qvel`, the columns in the generalised
-    coordinates; `range`, the lowest and the highest position, None without stops; `max_velocity`; and `max_torque`, the
-    largest nominal torque [N m] (force [N] for a slide) in either direction, None without a limit.
+    The keys are `name`; `unit`, that of the position (rad, or m for a slide); `qpos` and `qvel`, the columns in the
+    generalised coordinates; `range`, the lowest and the highest position; `max_velocity`; and `max_torque`, the largest
+    nominal torque [N m], or force [N] of a slide, in either direction. A limit is None if the joint does not have it.
     """
     model = task.physics.model
     if isinstance(task, LeggedRobot):
@@ -359,7 +359,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
         Quantity("base_ang_vel", lambda: task.base_ang_vel, "rad/s", "angular velocity of the base, base frame", AXES),
         Quantity("ground", lambda: task.height_scan.ground, "m", "height of the ground below the base, world frame"),
         Quantity("joint_pos", lambda: task.dof_pos, "rad", "angles of the joints with a motor", joints),
-        Quantity("joint_vel", lambda: task.dof_vel, "rad/s", "and their velocities", joints),
+        Quantity("joint_vel", lambda: task.dof_vel, "rad/s", "velocities of the joints with a motor", joints),
         Quantity("torque", lambda: task.torques, "N m", "torques of the last physics step", joints),
         Quantity("command", lambda: task.commands[:, :3], velocity, commanded, ("vx", "vy", "yaw")),
         Quantity("feet_pos", lambda: task.feet_pos, "m", "centres of the feet, world frame, by x, y, z", feet),
@@ -380,8 +380,8 @@ def _of_motors(task: BaseTask) -> list[Quantity]:
     low, high = torch.as_tensor(_control_ranges(model), dtype=torch.float32, device=physics.device)
     per_control = torch.as_tensor(_torque_per_control(model), dtype=torch.float32, device=physics.device)
     return [
-        Quantity("joint_pos", lambda: physics.qpos.index_select(1, positions), units, "joints with a motor", names),
-        Quantity("joint_vel", lambda: physics.qvel.index_select(1, velocities), f"{units} per s", "and velocities", names),
+        Quantity("joint_pos", lambda: physics.qpos.index_select(1, positions), units, "joint positions", names),
+        Quantity("joint_vel", lambda: physics.qvel.index_select(1, velocities), f"{units} per s", "joint velocities", names),
         Quantity("torque", lambda: physics.ctrl.clamp(low, high) * per_control, "N m", "torques of the motors", names),
     ]
 

@@ -23,17 +23,17 @@ ARRAYS, ABOUT, CONFIG, TABLE = "episodes.npz", "episodes.json", "episodes.yaml",
 MADE_OF_THEM = ("episodes.md", TABLE, "episode_[0-9]*.html", "joint_statistics.*")
 """Patterns of the files that are made from a recording, in the same folder."""
 TIME_UP, NO_NUMBERS = "time", "non_finite"
-"""Names of ends that no term stands for: the time was up, or physics blew up."""
+"""Names of ends without a termination term: the time was up, or physics blew up."""
 AXES = ("x", "y", "z")
 DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, MemoryError)
 """Errors that json, zipfile and NumPy raise for damaged files."""
 FORMAT = 1
 """Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
-"""Arrays with a row for each episode: its first row in the other arrays (and at the end their number of rows); the robot that
-ran it; flags of an end by a failure, of an end by time or by a term that is no failure, and of all terms, in the order of
-`terminations`; positions and velocities before its first step. The other arrays have a row for each control step, one episode
-after another.
+"""Arrays with a row for each episode. `episode_start` is its first row in the other arrays; one more entry is their number of
+rows. `robot` is the one that ran the episode. `failed` and `timed_out` flag an end by a failure, and by time or a term that
+is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before the first
+step. The other arrays have a row for each control step, one episode after another.
 """
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 JOINTS = ("joint_pos", "joint_vel", "torque")
@@ -110,7 +110,7 @@ class Episodes:
 
 
 def joint_unit(array: str, of_position: str) -> str:
-    """Return the unit of an array of joints, for a joint whose position is in radians or metres."""
+    """Return the unit of the array `array` for a joint whose position has the unit `of_position`, rad or m."""
     turning = of_position == "rad"
     return {"joint_pos": of_position, "joint_vel": f"{of_position}/s", "torque": "N m" if turning else "N"}[array]
 
@@ -125,7 +125,7 @@ def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
     make_folder(folder)
     with replacing(folder / ARRAYS) as part:
         np.savez(part, **clock_of(episodes), **episodes.arrays)  # type: ignore[arg-type]
-        # The old description is removed before the new arrays take their place, so that it never describes them.
+        # The old description is removed before the old arrays are replaced, so that it never describes the new arrays.
         for name in (ABOUT, CONFIG, *MADE_OF_THEM):
             for path in folder.glob(name):
                 path.unlink()

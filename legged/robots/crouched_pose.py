@@ -1,4 +1,4 @@
-"""A crouched pose, in which a fallen robot pulls its feet below the base before it stands up."""
+"""The crouched pose, with the feet pulled below the base, that a fallen robot takes before it stands up."""
 
 import numpy as np
 
@@ -18,9 +18,9 @@ def crouch(robot: Robot) -> np.ndarray | None:
     """Return joint angles (D,) [rad] of a crouched pose, in which the base is at most `CROUCH` times as high as in the
     default pose.
 
-    The angles are those of the default pose, except that the angles of joints that swing legs are multiplied by one factor
-    and clipped to their limits. Return None for a robot with fewer than four feet, with passive joints, or with legs that do
-    not bend so far.
+    The default angles of joints that swing legs are multiplied by one common factor and clipped to the joints' limits. Other
+    joints keep their default angles. Return None for a robot with fewer than four feet, with passive joints, or with legs
+    that do not bend so far.
     """
     if robot.passive is not None or len(robot.feet_indices) < FEWEST_FEET:
         return None

@@ -4,9 +4,9 @@ weight that the joint carries.
 Two inertias matter. With the robot in the air, a joint moves the links behind it against the rest of the robot. With the feet
 on the ground, the same joint moves the base as well.
 
-P gains give the first inertia a natural frequency that is the same for all robots, in units of sqrt(g / h). They are raised
-until no joint gives way under the robot's weight. D gains give the geometric mean of both inertias one damping ratio. Both
-gains are limited so that an explicit control law is stable at steps of 5 ms.
+P gains give the first inertia the natural frequency FREQUENCY sqrt(g / h), where h is the robot's standing height. They are
+raised until no joint gives way under the robot's weight. D gains give the geometric mean of the two inertias the damping
+ratio RATIO. Both gains are limited so that an explicit control law is stable at steps of 5 ms.
 
 For ANYmal C and Go2 the rule gives the makers' P gains within a factor of two. Its D gains are 0.7 to 2.4 times the makers'
 for ANYmal C, and 1.9 to 3.7 times for Go2.
@@ -18,19 +18,20 @@ import mujoco
 import numpy as np
 
 FREQUENCY = 6.0
-"""Natural frequency of a joint in the air, times sqrt(h / g) [1]: 4 Hz for a robot that stands half a metre high."""
+"""Natural frequency of a joint in the air, times sqrt(h / g) [1]. It is 4 Hz for a robot that stands h = 0.5 m high."""
 RATIO = 0.5
 """Damping ratio [1]."""
 SAG = 0.25
 """Largest deflection of a joint under the robot's weight [rad]."""
 SHIFT = 0.1
-"""Least P gain of a leg's joint in units of m g h [1/rad]; with less, an ankle could not shift the robot's weight."""
+"""Least P gain of a leg's joint, as a share of mass * g * h [1/rad]. With less, an ankle could not shift the weight."""
 LARGEST_TARGET = 0.3
-"""Least offset of a target at which the P gain demands the motor's whole torque [rad]."""
+"""P gains are limited so that only targets at least this far from the joint's angle demand the whole torque [rad]."""
 TIME_STEP = 0.005
 """Physics step in which an explicit control law has to be stable [s]."""
 MARGIN = 1.0
-"""Largest eigenvalue of TIME_STEP M^-1 D and of TIME_STEP^2 M^-1 K; from 2 on the explicit law diverges."""
+"""Largest eigenvalue allowed for TIME_STEP M^-1 D and TIME_STEP^2 M^-1 K, with inertia M, D gains D and P gains K. From 2 on,
+an explicit law may diverge."""
 
 VELOCITY_LIMIT = 30.0
 """Largest joint speed of a robot whose file states none [rad/s]. It is typical of the geared motors of legged robots."""
@@ -48,9 +49,10 @@ def gains(
     """Return stiffness [N m/rad] and damping [N m s/rad] (D,) of the hinges `joints` (ids).
 
     `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the motors'
-    torque limits [N m], and `height` the base's height above the ground [m]. `rolling` (D,) are the largest speeds of wheels
-    [rad/s], and 0 for other joints. A wheel has a gain on its speed [N m s/rad], and 0: an error of its largest speed demands
-    the whole effort, or less where the explicit law would not be stable with the wheel in the air.
+    torque limits [N m], and `height` the base's height above the ground [m]. `rolling` (D,) holds the largest speed of each
+    wheel [rad/s], and 0 for other joints. A wheel's stiffness is a gain on its speed [N m s/rad], and its damping is 0. An
+    error as large as the largest speed demands the whole torque. The gain is smaller if the explicit law would otherwise be
+    unstable in the air.
     """
     data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
@@ -64,7 +66,7 @@ def gains(
     leg = np.abs(jacobian[:, dofs]).max(axis=0) > 0.0
     least = np.maximum(weight / SAG, SHIFT * model.body_mass.sum() * gravity * height * leg)
     stiffness = np.minimum(np.maximum(in_air * FREQUENCY**2 * gravity / height, least), effort / LARGEST_TARGET)
-    # With these gains no eigenvalue of TIME_STEP^2 M^-1 K exceeds MARGIN (Gershgorin). Light links, such as toes, get less.
+    # This limit keeps all eigenvalues of TIME_STEP^2 M^-1 K within MARGIN (Gershgorin). It lowers the gains of light toes.
     stiffness = np.minimum(stiffness, MARGIN / (TIME_STEP**2 * np.abs(inverse[np.ix_(dofs, dofs)]).sum(axis=0)))
     damping = 2.0 * RATIO * np.sqrt(stiffness * np.sqrt(in_air * on_feet))
     damping = np.minimum(damping, MARGIN * in_air / TIME_STEP)
@@ -76,16 +78,16 @@ def gains(
 
 
 def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int]) -> np.ndarray:
-    """Return the inertia (D,) that the motor of each of the hinges `joints` (ids) turns [kg m^2], with the robot in the air
-    in the pose `qpos` and all other joints moving freely.
+    """Return the inertia (D,) [kg m^2] that each motor of the hinges `joints` (ids) turns while the robot is in the air in
+    the pose `qpos` and all other joints move freely.
     """
     dofs = model.jnt_dofadr[list(joints)]
     return np.asarray(1.0 / _inverse_inertia(model, qpos)[1][dofs, dofs])
 
 
 def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return the torques (D,) of the hinges `joints` (ids) that hold the robot at rest in the pose `qpos` [N m]. The shapes
-    `feet` (ids) carry the base with the least forces, in the sum of squares.
+    """Return the torques (D,) [N m] with which the hinges `joints` (ids) hold the robot at rest in the pose `qpos`. Of the
+    ground forces on the shapes `feet` (ids) that balance the weight, those with the least sum of squares are assumed.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -95,7 +97,7 @@ def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[i
 
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the joint-space inertia (V, V) for V degrees of freedom; `data` has to hold MuJoCo's poses and inertias."""
+    """Return the joint-space inertia (V, V) of V degrees of freedom. `mj_forward` has to have filled `data` before."""
     columns = np.zeros((model.nv, model.nv))
     for i, unit in enumerate(np.eye(model.nv)):
         mujoco.mj_mulM(model, data, columns[i], unit)
@@ -118,8 +120,6 @@ def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarr
 
 
 def _static_torques(data: mujoco.MjData, jacobian: np.ndarray) -> np.ndarray:
-    """Return the generalised forces (V,) that hold the robot at rest. The feet, whose Jacobian is given, carry the base with
-    the least forces.
-    """
+    """Return the generalised forces (V,) that hold the robot at rest (see `standing_torques`); `jacobian` is the feet's."""
     forces = np.linalg.lstsq(jacobian[:, :6].T, data.qfrc_bias[:6], rcond=None)[0]
     return np.asarray(data.qfrc_bias - jacobian.T @ forces)

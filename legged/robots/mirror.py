@@ -25,21 +25,23 @@ class Mirror:
     feet: tuple[int, ...]
     """(F,) for each foot, the index of the foot whose place it takes in the mirrored robot."""
     passive: tuple[int, ...] = ()
-    """(P,) partners of passive hinges and slides, and (P,) signs; both are empty if one of them has no partner."""
+    """(P,) partners of passive hinges and slides; `passive_signs` (P,) are their signs. Both are empty if a partner is
+    missing.
+    """
     passive_signs: tuple[float, ...] = ()
 
     @classmethod
     def of(
         cls, model: mujoco.MjModel, joints: Sequence[int], feet: Sequence[Sequence[str]], passive: Sequence[int] = ()
     ) -> "Mirror | None":
-        """Return the symmetry of a robot, which is found from the positions of its parts at zero angles.
+        """Find the symmetry of a robot from the positions of its joints and feet at zero angles.
 
         `joints` are the hinges with a motor (ids), `feet` the names of each foot's shapes, and `passive` the passive hinges
         and slides (ids). Return None if a joint or a foot has no partner.
         """
         data = mujoco.MjData(model)
         data.qpos[:] = 0.0
-        data.qpos[3] = 1.0  # puts the base level at the origin
+        data.qpos[3] = 1.0  # with the unit quaternion, the base is level
         data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_BALL]] = 1.0
         mujoco.mj_kinematics(model, data)
         partners, signs = _joint_partners(model, data, joints)
@@ -51,8 +53,8 @@ class Mirror:
         return cls(tuple(partners), signs, tuple(foot_partners), tuple(others or ()), their_signs)
 
     def uneven_joint(self, angles: np.ndarray) -> int | None:
-        """Return the first joint whose angle in `angles` (D,) [rad] differs from the mirrored angle of its partner; None if
-        the pose is symmetric.
+        """Return the index of the first joint whose angle in `angles` (D,) [rad] differs from the mirrored angle of its
+        partner; None if the pose is symmetric.
         """
         image = np.asarray(self.signs) * angles[list(self.joints)]
         apart = np.flatnonzero(np.abs(image - angles) > TURNED)
@@ -62,10 +64,10 @@ class Mirror:
 def _joint_partners(
     model: mujoco.MjModel, data: mujoco.MjData, joints: Sequence[int]
 ) -> tuple[list[int] | None, tuple[float, ...]]:
-    """Return partners and signs of hinges and slides; the partners are None if a joint has none."""
+    """Return the partners and the signs of hinges and slides; None and () if any of them lacks a partner."""
     anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
-    # The joints of a hip may share a point. They are told apart by the absolute values of the components of their axes,
-    # which a reflection keeps.
+    # Joints of a hip may have the same anchor. Their axes tell them apart, by the absolute values of the components, which
+    # a reflection does not change.
     partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
     if partners is None:
         return None, ()
@@ -77,7 +79,7 @@ def _joint_partners(
 
 
 def _partners(places: np.ndarray, reflected: np.ndarray) -> list[int] | None:
-    """Return for each row of `places` the index of the nearest row of `reflected`; None if a distance exceeds APART."""
+    """Return for each row of `places` the index of the nearest row of `reflected`; None if any is farther than APART."""
     distance = np.linalg.norm(places[:, None] - reflected[None], axis=2)
     if distance.size == 0 or (distance.min(axis=1) > APART).any():
         return None

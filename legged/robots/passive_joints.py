@@ -17,14 +17,14 @@ LARGEST_STEP = 0.3
 CLOSED = 1e-6
 """Largest error of a closed loop [m] or [rad]."""
 LEAST_STIFFNESS = 1e-3
-"""Stiffness of joints without a spring, relative to the stiffest spring. It keeps joints in place that no loop moves."""
+"""Stiffness assumed for joints without a spring, as a share of the stiffest spring's. It holds joints that no loop moves."""
 TRIES = 20
-"""Largest number of poses that are drawn for each pose that is needed."""
+"""Largest number of random poses that are tried for each pose that is needed."""
 
 
 @dataclass(frozen=True)
 class PassiveJoints:
-    """Passive joints of a robot with D driven joints. P passive joints are hinges and slides, the others are balls."""
+    """Passive joints of a robot with D driven joints. P of the passive joints are hinges and slides, the others are balls."""
 
     model: mujoco.MjModel
     driven: tuple[int, ...]
@@ -34,12 +34,12 @@ class PassiveJoints:
     names: tuple[str, ...]
     """(P,) names of the passive hinges and slides."""
     qpos_columns: tuple[int, ...]
-    """(P,) columns of the passive hinges and slides in the generalised positions; `qvel_columns`: in the velocities."""
+    """(P,) columns of the passive hinges and slides in the generalised positions; `qvel_columns` are for the velocities."""
     qvel_columns: tuple[int, ...]
 
     @classmethod
     def of(cls, model: mujoco.MjModel, driven: Sequence[int], passive: Sequence[int]) -> "PassiveJoints":
-        """Return the passive joints of a model whose joints are the base's, `driven` and `passive` (ids)."""
+        """Return the passive joints of a model. `driven` and `passive` are the ids of all its joints except the base's."""
         simple = [i for i in passive if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_BALL]
         return cls(
             model=model,
@@ -54,9 +54,9 @@ class PassiveJoints:
         """Return generalised positions (nq,) near `start` (nq,) with the driven joints at `angles` (D,), all loops closed and
         the least spring energy. Return None if the loops do not close at these angles.
 
-        The driven joints are moved from `start` in steps. In each step [K J'; J 0] [dq; l] = [-g; -c] is iterated, with the
-        stiffness K, the gradient g of the spring energy, and the Jacobian J and the errors c of the constraints. Gravity is
-        left out.
+        The driven joints are moved from `start` in steps. In each step, [K J'; J 0] [dq; l] = [-g; -c] is solved repeatedly
+        for the changes dq and the multipliers l. K is the stiffness, g the gradient of the spring energy, and J and c are the
+        Jacobian and the errors of the loops. Gravity is left out.
         """
         model, data = self.model, mujoco.MjData(self.model)
         columns = model.jnt_qposadr[list(self.driven)]
@@ -84,11 +84,11 @@ class PassiveJoints:
         return qpos if np.abs(errors).max(initial=0.0) < CLOSED else None
 
     def _loops(self, data: mujoco.MjData, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the errors (rows,) of the equality constraints, and their Jacobian (rows, nv)."""
+        """Return the errors (C,) of the C rows of equality constraints at `qpos`, and their Jacobian (C, nv)."""
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        mujoco.mj_makeConstraint(self.model, data)  # loops only: collisions were not computed, so there are no contacts
+        mujoco.mj_makeConstraint(self.model, data)  # without contacts, because no collisions were computed
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
         if len(rows):
@@ -116,7 +116,7 @@ class PassiveJoints:
 
     def draw(self, default: np.ndarray, factor: tuple[float, float], count: int, seed: int, where: str) -> np.ndarray:
         """Return (count, nq) random poses with closed loops. The angles of driven joints are those of `default` (nq,) times
-        random numbers from `factor`. Another pose is drawn if its loops do not close or passive joints leave their ranges.
+        random numbers from `factor`. Poses with open loops, or with passive joints beyond their ranges, are rejected.
 
         Raises:
             ConfigError: too few poses are possible; `where` is the place of `factor` in the configuration.
@@ -129,7 +129,7 @@ class PassiveJoints:
                 poses.append(pose)
             if len(poses) == count:
                 return np.array(poses)
-        raise ConfigError(f"{where}: the robot's loops close in too few of {TRIES * count} random poses, in {len(poses)}")
+        raise ConfigError(f"{where}: only {len(poses)} of {TRIES * count} random poses close the loops; {count} are needed")
 
 
 def default_qpos(

@@ -39,11 +39,11 @@ class RobotFile:
     default_joint_angles: dict[str, float] = field(metadata=between(-100, 100))
     """Joint-name pattern -> angle at action 0 [rad]."""
     feet: tuple[str, ...] = field(metadata=NAMES)
-    """Patterns of the shapes of the feet; all shapes of one body are one foot."""
+    """Patterns of the feet's shapes. All of these shapes on one body form one foot."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> P gain [N m/rad]; an empty table leaves the gains to a rule by inertia and weight (gains.py)."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the same rule."""
+    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the rule in gains.py."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest joint speed [rad/s]; an empty table means 30 for all joints."""
     penalize_contacts_on: tuple[str, ...] = ()
@@ -77,12 +77,12 @@ class Robot:
     torque_limits: np.ndarray
     """(D,) largest motor torques [N m]."""
     stiffness: np.ndarray
-    """(D,) P gains [N m/rad], and D gains [N m s/rad]; of wheels, gains on their speed [N m s/rad] and acceleration."""
+    """(D,) P gains [N m/rad]; `damping` (D,) are D gains [N m s/rad]. The gains of a wheel act on speed and acceleration."""
     damping: np.ndarray
     armature: np.ndarray
     """(D,) inertia of rotor and gear, reflected to the joint [kg m^2]."""
     inertia: np.ndarray
-    """(D,) inertia that each motor turns if the robot is in the air in its default pose [kg m^2]."""
+    """(D,) inertia that each motor turns while the robot is in the air in its default pose [kg m^2]."""
     wheels: np.ndarray
     """(D,) True if the joint turns a wheel."""
     swings: np.ndarray
@@ -107,8 +107,8 @@ class Robot:
     feet_shapes: tuple[tuple[str, ...], ...]
     """(F,) names of the shapes of each foot."""
     feet_indices: tuple[int, ...]
-    """(F,) indices of the feet among the contacts. The next two fields are indices of penalised contacts, and of contacts
-    that end an episode.
+    """(F,) indices of the feet among the contacts. `penalised_indices` and `termination_indices` are those of the contacts
+    that are penalised and that end an episode.
     """
     penalised_indices: tuple[int, ...]
     termination_indices: tuple[int, ...]
@@ -135,11 +135,11 @@ class Robot:
 
     @property
     def without_wheels(self) -> tuple[int, ...]:
-        """Indices of the joints that are no wheels: those whose angles have a meaning."""
+        """Indices of the joints that do not turn wheels."""
         return tuple(int(i) for i in np.flatnonzero(~self.wheels))
 
     def each(self, value: Any, where: str) -> np.ndarray:
-        """Return a value for each joint, (D,): those of a pattern table, or the same for all.
+        """Return a number for each joint (D,). `value` is one number for all, or maps patterns of joint names to numbers.
 
         Raises:
             ConfigError: a pattern matches no joint, or no pattern matches a joint.
@@ -148,8 +148,8 @@ class Robot:
         return match_values(value, self.joint_names, where) if table else np.full(self.num_dof, value)
 
     def with_armature(self, armature: np.ndarray) -> "Robot":
-        """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. Each joint's `inertia` is changed only by
-        its own rotor. The true inertia is a little larger if other rotors have become heavier.
+        """Return the same robot with other rotor inertias `armature` (D,) [kg m^2]. The `inertia` of a joint changes as much
+        as its own rotor inertia. The small effect of the other joints' rotors is neglected.
         """
         return replace(self, armature=armature, inertia=self.inertia + armature - self.armature)
 
@@ -234,11 +234,11 @@ def _folder(name: str, where: str) -> Path:
     robots = data_folder("resources") / "robots"
     known = suggest(name, [p.parent.name for p in robots.glob("*/robot.yaml")])
     if not name:
-        raise ConfigError(f"{where}: no robot is named{known}")
+        raise ConfigError(f"{where}: the name of the robot is empty{known}")
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()
-    if len(Path(name).parts) > 1:  # a run from another machine names a folder of that machine
+    if len(Path(name).parts) > 1:  # perhaps a folder of another machine, on which a run was made
         raise ConfigError(
             f"{where}: there is no robot {shown(name)}: that folder has no robot.yaml. "
             "If the robot was moved, give its new folder: robot=FOLDER"

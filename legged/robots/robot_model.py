@@ -17,13 +17,13 @@ from legged.robots.reserved_names import RESERVED
 GROUPS = 31
 """Number of actuator groups that a model can disable; they are numbered from 0."""
 LARGEST_NUMBER = 1e12
-"""Largest number allowed in a model; with larger numbers float32, in which GPUs compute, overflows."""
+"""Largest number allowed in a model. Larger numbers may overflow in float32, with which GPUs compute."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
 """Prefixes of the names of a model's arrays of numbers."""
 
 
 def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
-    """Return the model in `file` in `folder`; `where` is the file that names the model, for error messages.
+    """Return the compiled model of `file` in `folder`. `where` is the file that names the model, for error messages.
 
     Raises:
         ConfigError: there is no such file, MuJoCo refuses it, or its numbers or options are not allowed.
@@ -38,7 +38,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
             model = robot_spec_of(path).compile()
     except ConfigError as error:
         raise ConfigError(f"{where}: model: {error}") from error
-    except Exception as error:  # MuJoCo raises errors of no special class
+    except Exception as error:  # MuJoCo's errors have no class of their own
         raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
     if warnings:
         raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
@@ -49,7 +49,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
             values = getattr(owner, name)
             numeric = isinstance(values, float) or (isinstance(values, np.ndarray) and values.dtype.kind == "f")
             if numeric and not (np.abs(values) <= LARGEST_NUMBER).all():
-                raise ConfigError(f"{at}: numbers must be finite and below {LARGEST_NUMBER:g} ({name}, once compiled)")
+                raise ConfigError(f"{at}: compiled {name}: numbers must be finite and at most {LARGEST_NUMBER:g}")
     for flag in ("CONTACT", "CONSTRAINT", "ACTUATION"):
         if model.opt.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}"):
             raise ConfigError(f"{at}: option flag: {flag.lower()} is disabled; without it the robot could not walk")
@@ -57,7 +57,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
         raise ConfigError(f"{at}: option actuatorgroupdisable: group {group} has motors and must not be disabled")
     for flag in ("SLEEP", "IPC"):
         if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
-            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; leave it out, its state is not kept per robot")
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; leave it out: its state is not kept per robot")
     return model
 
 
@@ -106,12 +106,12 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
 
 
 def aimless_shapes(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return a line if collision bits keep shapes apart from a ground with MuJoCo's default bits or with those of the task's
-    own; else nothing. The task gives all collision shapes bits that meet the ground.
+    """Return one line with the collision shapes whose own bits would not let them collide with the ground, or no line. The
+    task replaces the bits of all collision shapes, so that they collide with the ground.
     """
     touched, meets = model.geom_contype | model.geom_conaffinity, (model.geom_contype & 1) | (model.geom_conaffinity & 3)
     names = [model.geom(int(i)).name for i in np.flatnonzero((touched != 0) & (meets == 0))]
-    said = "shapes whose collision bits would not meet the ground meet it all the same"
+    said = "shapes collide with the ground, although their own collision bits would not allow it"
     return (f"{said}: {', '.join(names)[:200]}",) if names else ()
 
 
@@ -155,7 +155,7 @@ def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], wher
 
 
 def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -> None:
-    """Check that actuators apply their controls as torques, because the task computes the joints' torques."""
+    """Check that each driven hinge has one torque motor with a valid limit, in the order of the hinges."""
     names = tuple(model.joint(i).name for i in driven_joints(model, passive))
     on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))

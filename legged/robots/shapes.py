@@ -11,7 +11,7 @@ from legged.robots.patterns import match_names
 
 @dataclass(frozen=True)
 class Shapes:
-    """S collision shapes in the order of the model, and B contacts, for each of which one force is computed. All shapes of a
+    """S collision shapes in the order of the model, and B contacts. One force is computed for each contact. All shapes of a
     foot share a contact, and every other shape has its own. Contacts are in the order of their first shapes.
     """
 
@@ -30,7 +30,7 @@ class Shapes:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, feet: Sequence[str], where: str) -> "Shapes":
-        """Return the shapes of a model. The patterns `feet` name the feet's shapes; shapes of one body are one foot.
+        """Return the shapes of a model. The patterns `feet` name the feet's shapes; those of one body form one foot.
 
         Raises:
             ConfigError: a pattern matches neither shape nor body; `where` is the place of the patterns.
@@ -56,7 +56,7 @@ class Shapes:
         )
 
     def contacts(self, patterns: Sequence[str], where: str) -> tuple[int, ...]:
-        """Return the indices, each once, of the contacts of all shapes that the patterns name. Raises: see `of`."""
+        """Return the sorted indices of the contacts that have a shape named by the patterns. Raises the errors of `of`."""
         return tuple(sorted({self.contact[i] for i in match_shapes(patterns, self.names, self.bodies, where)}))
 
 
@@ -75,8 +75,8 @@ def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence
 
 
 def _common_name(names: Sequence[str], body: str) -> str:
-    """Return the name of a contact: the common beginning of its shapes' `names`, without separators at the end, or the name
-    of the `body` if they have none.
+    """Return the name of a contact: the common beginning of its shapes' `names`, without separators at the end. If the names
+    have no common beginning, the contact has the name of the `body`.
     """
     if len(names) == 1:
         return names[0]

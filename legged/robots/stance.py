@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 ALONG = 0.7
-"""Least y component, in the base's frame, of the axis of a joint that swings a leg forward: at most 45 degrees from y."""
+"""Least |y|, base frame, of the unit axis of a joint that swings a leg forward: the axis is within 45 degrees of y."""
 
 
 def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
@@ -40,14 +40,14 @@ def lowest_point(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float
 
 
 def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float:
-    """Return the height of the base above the lowest collision shape at `qpos` (nq,), in which the base is level [m]."""
+    """Return the height [m] of a level base above the lowest point of all collision shapes at `qpos` (nq,)."""
     data = stance(model, qpos)
     shapes = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return float(data.body(base).xpos[2] - min(lowest_point(model, data, int(i)) for i in shapes))
 
 
 def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return flags (D,) of those hinges `joints` (ids) that swing a leg forward and back: hip pitch, knee and ankle pitch.
+    """Return (D,) True for each of the hinges `joints` (ids) that swings a leg forward and back: at hip, knee and ankle.
 
     Each of these hinges lies between the base and one of the shapes `feet` (ids), and its axis points sideways in the pose
     `qpos`, in which the base is level.

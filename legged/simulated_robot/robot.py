@@ -1,7 +1,7 @@
-"""One robot in C MuJoCo, with sensors and with the motors of training. Commands may arrive at any time.
+"""One robot in C MuJoCo, with sensors and with the motor model of training. Commands may arrive at any time.
 
-`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot, they
-take 0.1 ms per physics step in torch, but 0.02 ms in numpy, which is about as long as MuJoCo's own step.
+`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot, the
+formulas take 0.1 ms per physics step in torch, but 0.02 ms in numpy. MuJoCo's own step takes about 0.02 ms too.
 """
 
 from collections import deque
@@ -25,9 +25,9 @@ from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
-"""Additional sources. A simulator knows them; a real robot would have to estimate them."""
+"""Additional sources of observations. The simulator knows them; a real robot would have to estimate them."""
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
-"""Warnings of MuJoCo that accompany a reset of the state."""
+"""MuJoCo's warnings that a state is unstable, after which MuJoCo resets the state."""
 FALLEN = 1.2
 """Tilt of the base above which the robot has fallen [rad]."""
 OURS = "control.actuator"
@@ -37,9 +37,9 @@ OURS = "control.actuator"
 def motors_config(
     robot: Robot, contract: Contract | None, ideal: bool, changes: Iterable[tuple[str, Any]], dt: float
 ) -> tuple[ActuatorConfig, float]:
-    """Return the configuration of the motors and the time unit of their delay [s]. The motors are ideal, or those with
-    which the policy of `contract` was trained. `changes` of control.actuator apply to either. Without a contract, the time
-    unit is the motors' step `dt`.
+    """Return the configuration of the motors, and the time unit of their delay [s]. The motors are ideal, or those of the
+    training of `contract` if it is given and `ideal` is False. Then `changes` to control.actuator are made. The time unit is
+    the training's physics step, or `dt` without a contract.
 
     Raises:
         ConfigError: a change concerns another section, or the motors do not fit the robot or the step.
@@ -70,7 +70,7 @@ class Motors:
     """Motors of D joints: delay, control law, torque limits and friction."""
 
     def __init__(self, robot: Robot, cfg: ActuatorConfig, dt: float, counted: float, seed: int = 1) -> None:
-        """Create motors with the step `dt` [s]. Delays of `cfg` count steps of `counted` [s], and are drawn with `seed`."""
+        """Create motors for steps of `dt` [s]. Delays in `cfg` are in units of `counted` [s]; `seed` is for random delays."""
         self._effort = robot.torque_limits
         self._stall, self._fastest = motor_numbers(robot, cfg)
         self._coulomb, breakaway, self._viscous = friction_numbers(robot, cfg)
@@ -132,8 +132,8 @@ class SimulatedRobot:
     def __init__(
         self, robot: Robot, terrain: Terrain | None, sim: SimConfig, motors: Motors | None = None, scan: str = SCANS[0]
     ) -> None:
-        """Build the world with the solver options of `sim`. Motors are ideal by default. The setting terrain.scan, `scan`,
-        applies to the source `heights`.
+        """Build the world with the solver options of `sim`. Motors are ideal by default. `scan` is the setting terrain.scan,
+        for the source `heights`.
         """
         self.robot, self._terrain = robot, terrain
         self.model = RobotScene(robot, terrain).model(sim)
@@ -182,7 +182,7 @@ class SimulatedRobot:
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
     def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
-        """Return the present measurements and the requested sources. `sources` gives the points (P, 2) of `heights`."""
+        """Return the present measurements and the requested `sources`. The value of `heights` is its points (P, 2) [m]."""
         data = self.data
         return Reading(
             time=float(data.time),

@@ -13,7 +13,7 @@ from legged.deploy import udp
 from legged.simulated_robot.robot import SimulatedRobot
 
 STATE_S = 0.004
-"""Interval between states, rounded to physics steps [s]."""
+"""Interval between states that are sent, rounded to whole physics steps [s]."""
 POSE_S = 0.04
 """Interval between the poses that are kept for a film [s]. At most `MOST_POSES` poses are kept."""
 MOST_POSES = 750
@@ -53,10 +53,10 @@ class Server:
     """Real-time loop that steps a robot, sends its states and applies commands."""
 
     def __init__(self, robot: SimulatedRobot, latency_s: float = 0.0, loss: float = 0.0, seed: int = 1) -> None:
-        """Take a free port of this machine. Both directions delay packets by `latency_s` [s] and lose a share `loss`."""
+        """Open a free port of this machine. Each direction delays packets by `latency_s` [s] and loses a share `loss`."""
         self.robot = robot
         self.poses: list[np.ndarray] = []
-        """Time [s] and MuJoCo's generalised positions, (1 + nq,) each."""
+        """Recorded poses (1 + nq,): time [s] and MuJoCo's generalised positions."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 0))
         self._socket.setblocking(False)
@@ -115,20 +115,20 @@ class Server:
                 break
             kind, sequence, body = udp.open_packet(data) or (None, 0, b"")
             if kind == udp.HELLO:
-                with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):  # packets of unknown senders
+                with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):  # unknown senders may send anything
                     self._sources = udp.unpack_sources(body)
                     if client != self._client:
                         self._newest = 0
-                    self._client = client  # from now on, it receives the states
+                    self._client = client  # this client receives the states from now on
                     self._socket.sendto(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)), client)
-            elif client == self._client and kind == udp.BYE:  # never delayed or lost, so that the simulation always ends
+            elif client == self._client and kind == udp.BYE:  # a goodbye is never lost, so the simulation ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
                 self._in.put(now, (sequence, body))
         for sequence, body in self._in.take(now):
             with suppress(ValueError):
                 _, asked = udp.unpack_command(body)
-                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # newer than the last one taken
+                if sequence > self._newest and asked.shape == self.robot.asked.shape:  # newer than the last command
                     self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:

@@ -64,7 +64,7 @@ def test_the_box_of_its_inertia_stands_for_a_trunk_without_a_shape(added):
      <collision><geometry><mesh filename="nowhere.stl"/></geometry></collision></link>
     """
     out = added(urdf(trunk=bare), "--name", "bare_toy")
-    assert "guess: nothing of the trunk collides, so the box that has the base's inertia does" in out
+    assert "guess: the trunk has no collision shapes, so a box with the base's inertia is added" in out
     assert "guess: contact that ends an episode: trunk\n" in out
     robot = load_robot("mine/bare_toy")
     assert [robot.contact_names[i] for i in robot.termination_indices] == ["trunk"]
@@ -107,7 +107,7 @@ def test_shapes_whose_names_are_parts_of_others_have_their_roles(added):
     ball = '<collision><geometry><sphere radius="0.03"/></geometry></collision>'
     out = added(text.replace('<link name="fr_thigh0">', f'<link name="fr_thigh0">{ball}'), "--name", "eighteenth_toy")
     changed = "trunk -> trunk_itself, fr_thigh -> fr_thigh_itself"
-    assert f"shapes whose names are parts of others' are called differently: {changed}" in out
+    assert f"shapes are renamed if other shapes' names contain their names: {changed}" in out
     robot = load_robot("mine/eighteenth_toy")
     names = np.array(robot.contact_names)
     assert set(names[list(robot.termination_indices)]) == {"trunk_itself"}
@@ -124,7 +124,7 @@ def test_gains_may_be_given_and_joints_held(added):
     robot = load_robot("mine/fourth_toy")
     assert (robot.num_dof, robot.mass) == (12, pytest.approx(14.0))
     assert set(robot.stiffness) == {40.0}
-    assert "joints are held as asked: arm at 1 rad" in out
+    assert "joints are held because of --hold: arm at 1 rad" in out
 
 
 @pytest.mark.slow
@@ -154,8 +154,8 @@ def test_legs_that_nothing_touches_get_feet(added):
     """A ball at the centre of mass of the last link: of a calf of 0.2 kg at -0.1 and a foot of 0.05 kg at -0.2, at -0.12."""
     text = re.sub(r"<collision>.*?</collision>", "", urdf().replace('<box size="0.5 0.16 0.1"/>', ""), flags=re.DOTALL)
     out = added(text, "--name", "twelfth_toy")
-    assert "legs end in links that nothing touches, without a foot: a ball is added at the end of: fl_calf, fr_calf" in out
-    assert "guess: nothing of the trunk collides, so the box that has the base's inertia does" in out
+    assert "legs end in links without collision shapes, so a ball is added as the foot: fl_calf, fr_calf" in out
+    assert "guess: the trunk has no collision shapes, so a box with the base's inertia is added" in out
     model = mujoco.MjModel.from_xml_path("mine/twelfth_toy/twelfth_toy.xml")
     np.testing.assert_allclose(model.geom("fl_foot").pos, [0, 0, -0.12], atol=1e-9)
 
@@ -169,7 +169,7 @@ def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_pa
     cylinder = '<collision><origin xyz="0 0 -0.09"/><geometry><cylinder radius="0.01" length="0.16"/></geometry>'
     mesh = '<collision><origin xyz="0 0 -0.1"/><geometry><mesh filename="calf.obj"/></geometry>'
     out = added(urdf().replace(cylinder, mesh), "--name", "thirteenth_toy")
-    assert "a mesh that has the foot in it end above the foot: fl_calf, fr_calf, hl_calf, hr_calf" in out
+    assert "a mesh that includes the foot are shortened to end above the foot: fl_calf, fr_calf, hl_calf, hr_calf" in out
     model = mujoco.MjModel.from_xml_path("mine/thirteenth_toy/thirteenth_toy.xml")
     np.testing.assert_allclose(sorted(model.geom("fl_calf").size), [0.01, 0.02, 0.095], atol=1e-6)
     np.testing.assert_allclose(model.geom("fl_calf").pos, [0, 0, -0.085], atol=1e-6)
@@ -189,7 +189,7 @@ def test_a_robot_that_looks_along_y_is_turned(added):
     for (x, y), (old_x, old_y) in zip(places.values(), ((0.2, 0.1), (0.2, -0.1), (-0.2, 0.1), (-0.2, -0.1)), strict=True):
         text = text.replace(f'xyz="{old_x} {old_y} 0"', f'xyz="{x} {y} 0.0"')
     out = added(text, "--name", "sixth_toy")
-    assert "by its names its left side is not at +y: it is turned by 270 degrees" in out
+    assert "by the names, the left side is not at +y: the robot is turned by 270 degrees" in out
     model = mujoco.MjModel.from_xml_path("mine/sixth_toy/sixth_toy.xml")
     np.testing.assert_allclose(model.body("fl_hip").pos, [0.2, 0.1, 0.0], atol=1e-9)
 

@@ -63,7 +63,7 @@ def degrees(text: str) -> str:
         (urdf().replace("<axis", '<mimic joint="fl_knee"/><axis', 1), "mimic: there is no joint 'fl_knee'"),
         (
             urdf(trunk=MESHED.format('scale="1000 1000 1000"')),
-            "mesh 'Cube.OBJ' is 400 m long; one in millimetres needs scale=",
+            "mesh 'Cube.OBJ' is 400 m long; if it is in millimetres, add scale=",
         ),
     ],
 )

@@ -52,7 +52,7 @@ def test_a_robot_that_can_not_stand_on_what_looks_like_its_feet_is_refused(tmp_p
     (tmp_path / "toy.urdf").write_text(arms)
     assert call(add.main, ["toy.urdf", "--out", "mine"]) == 2
     error = capsys.readouterr().err
-    assert "toy.urdf: it can't stand on " in error
+    assert "toy.urdf: the robot can't stand on " in error
     assert error.count("\n") == 1
     assert not Path("mine").exists()
 

@@ -182,7 +182,7 @@ def test_gains_of_the_file_are_kept_where_wheels_have_none(added):
         file="toy.xml",
     )
     assert "gains are those of the file's position actuators" in out
-    assert "guess: gains of joints without a position actuator are a rule's: lf_spin, rf_spin" in out
+    assert "guess: a rule chooses the gains of joints without a position actuator: lf_spin, rf_spin" in out
     robot = load_robot("mine/mixed")
     assert robot.stiffness[:4] == pytest.approx([25.0, 30.0, 35.0, 0.5], rel=0.02)
     assert robot.damping[:4] == pytest.approx([0.6, 0.6, 0.6, 0.0])

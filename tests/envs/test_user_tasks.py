@@ -248,7 +248,7 @@ def test_a_robot_of_a_registered_mapping_lies_beside_its_module(show, monkeypatc
 
 def test_no_robot_at_all_is_said(error):
     written("mine.yaml", "env: {num_envs: 3}\n")
-    assert "robot: no robot is named" in error("--task", "mine.yaml")
+    assert "robot: the name of the robot is empty" in error("--task", "mine.yaml")
 
 
 # ---- modules -------------------------------------------------------------------------------------------------------------

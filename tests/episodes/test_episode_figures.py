@@ -57,7 +57,7 @@ def test_what_failed_comes_first_and_then_what_is_worst():
     assert order_of(figures, "length", "contact") == [3, 1]
     assert counts_text(figures) == "4 episodes, 2 failed; ended: 2 by contact, 1 by time, 1 by tilt"
     assert order_of(figures, "fell", "non_finite") == []
-    with pytest.raises(ConfigError, match="--ended: contakt: no episode ends by it; did you mean 'contact'"):
+    with pytest.raises(ConfigError, match="--ended: contakt: no such term ends episodes; did you mean 'contact'"):
         order_of(figures, "fell", "contakt")
     with pytest.raises(ConfigError, match="--sort: speed: these episodes have no such figure"):
         order_of(figures, "speed")

@@ -157,7 +157,7 @@ def test_two_policies_are_compared(capsys):
         ([*HERE, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         ([*HERE, "--episodes", "100000"], "--episodes: must be at most 4,096, got 100,000"),
         ([*HERE, "--num-envs", "9"], "--num-envs: 9 robots are too many for 3 episodes"),
-        ([*HERE, "--ended", "contakt"], "--ended: contakt: no episode ends by it; did you mean 'contact'?"),
+        ([*HERE, "--ended", "contakt"], "--ended: contakt: no such term ends episodes; did you mean 'contact'?"),
         ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
         ([*HERE, "--page", "7"], "--page: there is no episode 7; episodes are numbered 0 to 2"),
         ([*HERE, "--top", "-1"], "--top: must be at least 0"),

@@ -220,7 +220,7 @@ def test_a_fragment_that_refers_to_a_scene_is_read(read):
     )
     tree = read(text)
     assert tree.mass == pytest.approx(12.0)
-    assert any("1 meshes are not beside the file" in line for line in tree.said)
+    assert any("1 mesh files do not exist" in line for line in tree.said)
 
 
 def test_shapes_that_only_pairs_let_touch_collide(read):
@@ -329,7 +329,7 @@ def test_loops_and_springs_are_kept(read, tmp_path):
     [
         (
             "<mujoco><worldbody><geom size='1'/></worldbody></mujoco>",
-            "nothing in it turns: no body that hangs on another one has a hinge",
+            "holds no robot: no body that hangs on another body has a hinge",
         ),
         ("<mujoco><worldbody><body/></worldbody>", "MuJoCo refuses it"),
         ("<mujoco><compiler coordinate='global'/></mujoco>", "MuJoCo refuses it"),

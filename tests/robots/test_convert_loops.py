@@ -93,9 +93,9 @@ def test_a_hinge_is_held_where_another_one_of_its_body_turns(tmp_path):
 @pytest.mark.parametrize(
     ("tied", "hold", "said"),
     [
-        ('<joint joint1="c" joint2="d"/>', ("d",), "constraints of joints that are held are left out, of: c and d"),
+        ('<joint joint1="c" joint2="d"/>', ("d",), "constraints of held joints are left out: c and d"),
         (CONNECT, ("a", "b", "c"), None),
-        ('<connect body1="hand" body2="arm" anchor="0 0 0"/>', ("c",), "welded to each other are left out, of link: arm"),
+        ('<connect body1="hand" body2="arm" anchor="0 0 0"/>', ("c",), "welded to each other are left out: arm"),
     ],
 )
 def test_what_ties_parts_that_are_held_is_left_out(tmp_path, tied, hold, said):
@@ -122,7 +122,7 @@ LEG = """
 
 @pytest.mark.usefixtures("workplace")
 def test_hinges_without_a_motor_become_passive_joints(tmp_path, capsys):
-    """Feet on springs. Their joints' names are parts of the others' names, so they are called differently."""
+    """Feet on springs. Their joints' names are parts of the others' names, so they are renamed."""
     sides = {"fl": (0.2, 0.1), "fr": (0.2, -0.1), "hl": (-0.2, 0.1), "hr": (-0.2, -0.1)}
     legs = "".join(LEG.format(n=n, x=x, y=y) for n, (x, y) in sides.items())
     motors = "".join(f'<motor joint="{n}_{joint}" forcerange="-20 20"/>' for n in sides for joint in ("hip", "knee"))
@@ -131,7 +131,7 @@ def test_hinges_without_a_motor_become_passive_joints(tmp_path, capsys):
         f"</worldbody><actuator>{motors}</actuator></mujoco>"
     )
     assert call(add.main, ["springs.xml", "--out", "mine"]) == 0, capsys.readouterr().err
-    assert "are called differently: fl -> fl_passive" in capsys.readouterr().out
+    assert "names contain their names: fl -> fl_passive" in capsys.readouterr().out
     robot = load_robot("mine/springs")
     assert robot.joint_names == tuple(f"{n}_{joint}" for n in sides for joint in ("hip", "knee"))
     assert robot.passive is not None

@@ -28,14 +28,14 @@ def read(tmp_path, head="", joint="", body="", tendon="", actuator=MOTORS):
         ({"tendon": TENDON.format('stiffness="0.1"')}, "tendons are left out: band (stiffness)"),
         ({"tendon": TENDON.format('damping="1" range="-1 1"')}, "tendons are left out: band (damping, limited)"),
         ({"body": 'gravcomp="0.01"'}, "gravity compensation is left out: b"),
-        ({"joint": 'stiffness="1 .2"'}, "springs of joints that are not linear become linear: a"),
+        ({"joint": 'stiffness="1 .2"'}, "nonlinear springs of joints become linear: a"),
         ({"head": '<option density="1.2"/>'}, "drag of air and water is left out: density"),
-        ({"actuator": SERVO.format('dyntype="filterexact" dynprm=".04"')}, "late: s (filterexact, 0.04 s)"),
+        ({"actuator": SERVO.format('dyntype="filterexact" dynprm=".04"')}, "stand in for them: s (filterexact, 0.04 s)"),
         ({"actuator": SERVO.format('forcerange="-10 30"')}, "become the smaller one: s (-10 to 30 N m)"),
         ({"joint": 'actuatorfrcrange="-5 8"'}, "become the smaller one: a (-5 to 8 N m)"),
         (
             {"actuator": SERVO.replace('gainprm="9"', 'gaintype="affine" gainprm="9 1"').format("")},
-            "law here: s (gain affine, bias affine)",
+            "control law: s (gain affine, bias affine)",
         ),
     ],
 )
@@ -52,9 +52,9 @@ def test_what_is_kept_has_none(tmp_path):
     ("parts", "says"),
     [
         # At 90 degrees each, a band of 15 N/rad pulls with 15 pi N m on both joints.
-        ({"tendon": TENDON.format('stiffness="15"')}, r"joint 'a' misses up to .* of 20 N m .*tendons are left out: band"),
-        ({"joint": 'stiffness="1 30"'}, r"joint 'a' misses up to .* of 20 N m"),
-        ({"body": 'gravcomp="1"'}, r"(the base|joint 'b') misses up to"),
+        ({"tendon": TENDON.format('stiffness="15"')}, r"'a' would lack up to .* of 20 N m .*tendons are left out: band"),
+        ({"joint": 'stiffness="1 30"'}, r"joint 'a' would lack up to .* of 20 N m"),
+        ({"body": 'gravcomp="1"'}, r"(the base|joint 'b') would lack up to"),
         (
             {"actuator": '<muscle name="m" joint="a" ctrlrange="0 1" lengthrange="0 1"/><motor joint="b"/>'},
             "actuator 'm' is a muscle",

@@ -283,7 +283,7 @@ def test_collision_bits_that_meet_no_ground_have_a_line(folder):
     assert not load_robot(str(folder)).adaptations
     edit(folder / "anymal_c.xml", 'contype="1" conaffinity="2"', 'contype="4" conaffinity="8"')
     (line,) = load_robot(str(folder)).adaptations
-    assert line.startswith("shapes whose collision bits would not meet the ground meet it all the same: base")
+    assert line.startswith("shapes collide with the ground, although their own collision bits would not allow it: base")
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_collision_bits_that_meet_no_ground_have_a_line(folder):
         ('<motor name="RH_KFE" joint="RH_KFE"/>', "", "needs one motor per hinge in the same order"),
         (MOTOR, MOTOR.replace("joint", "site").replace('"LF_HAA"/>', '"imu"/>'), "one motor per hinge in the same order"),
         ('forcerange="-80 80"', 'forcerange="80 -80"', "every motor needs a forcerange"),
-        ('forcerange="-80 80"', 'forcerange="-inf inf"', "numbers must be finite and below 1e+12 (actuator_forcerange"),
+        ('forcerange="-80 80"', 'forcerange="-inf inf"', "compiled actuator_forcerange: numbers must be finite"),
         ('forcerange="-80 80"', 'forcerange="-80 90"', "the same both ways"),
         ('ctrlrange="-80 80"', 'ctrlrange="-1 1"', "ctrlrange [-1, 1]; it must not be narrower than forcerange [-80, 80]"),
         # What the scene brings.
@@ -307,7 +307,7 @@ def test_collision_bits_that_meet_no_ground_have_a_line(folder):
         ('mass="26.37317"', 'mass="inf"', "numbers must be finite"),
         ('mass="26.37317"', 'mass="0"', "MuJoCo refuses it"),
         ('name="imu" pos="0 0 0"', 'name="imu" pos="nan 0 0"', "MuJoCo warns: XML contains a 'NaN'"),
-        ("<worldbody>", '<option gravity="0 0 inf"/><worldbody>', "numbers must be finite and below 1e+12 (gravity"),
+        ("<worldbody>", '<option gravity="0 0 inf"/><worldbody>', "compiled gravity: numbers must be finite"),
         # Files.
         ("<worldbody>", '<include file="nowhere.xml"/><worldbody>', "nowhere.xml"),
         ("<asset>", '<asset><mesh name="m" file="nowhere.obj"/>', "nowhere.obj"),

@@ -13,12 +13,12 @@ SHARE, ELSEWHERE = 0.4, 0.1
 """Guessed torque limits of leg joints and of other joints, as shares of weight times base height."""
 GRAVITY = 9.81
 SAG = 1.0
-"""Largest deflection under the robot's weight with the file's gains [rad]; with a larger one the gains are left out."""
+"""Largest deflection of a joint under the robot's weight [rad]. The file's gains are left out if they allow a larger one."""
 
 
 def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
-    """Guess the missing torque limits of motors from the weight and height [m] of the robot. A hinge that the file limits to
-    another value keeps it.
+    """Guess the missing torque limits of motors from the weight and the `height` [m] of the robot. Limits that the file
+    states are kept.
     """
     weight = sum(link.mass for link in tree.links) * GRAVITY * height
     of_legs = {name for leg in legs for name in leg.hinges}
@@ -30,8 +30,8 @@ def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
 
 
 def speed_limits(tree: Tree) -> dict[str, float]:
-    """Return the speed limits of all hinges with a motor [rad/s] if the file states any, with a default for missing ones;
-    else an empty table.
+    """Return hinge -> speed limit [rad/s] for all hinges with a motor, with a default for missing limits. The table is empty
+    if the file states no limits.
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     if not any(hinge.velocity for hinge in driven):
@@ -43,7 +43,7 @@ def speed_limits(tree: Tree) -> dict[str, float]:
 
 
 def give_rotors(tree: Tree, angles: dict[str, float]) -> None:
-    """Give the wheels that are too light for a gain on their speed a rotor with the inertia that they lack, in the pose at
+    """Add a rotor inertia (armature) to the wheels that are too light for a stable gain on their speed, in the pose at
     `angles` [rad].
     """
     wheels = [hinge for hinge in tree.hinges if hinge.rolls and hinge.driven]
@@ -54,14 +54,15 @@ def give_rotors(tree: Tree, angles: dict[str, float]) -> None:
         if missing > 0.0:
             hinge.passive["armature"] = round(hinge.passive.get("armature", 0.0) + 1.01 * missing, 6)
             tree.say(
-                "guess: wheels that are too light for a motor of that torque and speed have rotors",
+                "guess: wheels too light for the torque and speed of their motors get this rotor inertia",
                 f"{hinge.name} {hinge.passive['armature']:.3g} kg m^2",
             )
 
 
 def rule_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str], height: float) -> tuple[dict[str, float], ...]:
-    """Return the rule's P and D gains by hinge, as for a robot.yaml without gains: in the pose at `angles` [rad], with the
-    base at `height` [m] on the shapes `feet`. Those of wheels are gains on their speed [N m s/rad], and 0.
+    """Return hinge -> P gain [N m/rad] and hinge -> D gain [N m s/rad] by the rule for a robot without gains (gains.py). The
+    robot is in the pose at `angles` [rad], with the base at `height` [m], on the shapes `feet`. The P gain of a wheel is a
+    gain on its speed [N m s/rad], and its D gain is 0.
     """
     driven = [hinge for hinge in tree.hinges if hinge.driven]
     poser = Poser(tree)
@@ -76,12 +77,12 @@ def rule_gains(tree: Tree, angles: dict[str, float], feet: Sequence[str], height
 def take_gains(
     tree: Tree, angles: dict[str, float], feet: Sequence[str], height: float
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return P and D gains [N m/rad], [N m s/rad] by hinge, from the file's position actuators, and from the rule for hinges
-    whose actuators have none. Those of wheels are as `rule_gains` returns them.
+    """Return hinge -> P gain [N m/rad] and hinge -> D gain [N m s/rad] of the file's position actuators. Other hinges have
+    the gains of `rule_gains`; a wheel's velocity actuator may lower them.
 
-    For a hinge whose actuator has no D gain, the damping of the joint becomes the D gain and is removed from the joint. The
-    tables are empty if the file has no gains, if nothing is damped, or if the gains would not hold the robot up on the shapes
-    `feet` in the pose at `angles` [rad], with the base at `height` [m].
+    If an actuator has no D gain, the damping of the joint becomes the D gain and is removed from the joint. Both tables are
+    empty if the file has no gains, if nothing is damped, if the explicit law would be unstable, or if the robot would sink
+    too far on the shapes `feet` in the pose at `angles` [rad], with the base at `height` [m].
     """
     stated = [hinge for hinge in tree.hinges if hinge.driven and hinge.stiffness and not hinge.rolls]
     if not stated:
@@ -100,7 +101,7 @@ def take_gains(
     if grows > 1.0:
         tree.say(
             f"gains of the file's position actuators are left out: at steps of {TIME_STEP * 1000:g} ms an explicit law with"
-            f" them makes deviations grow by {grows:.3g} a step"
+            f" them makes deviations {grows:.3g} times as large in each step"
         )
         return {}, {}
     sags = _sags(tree, angles, stiffness, feet)
@@ -114,16 +115,16 @@ def take_gains(
     for hinge in stated:
         if not hinge.damping and "damping" in hinge.passive:
             del hinge.passive["damping"]
-            tree.say("damping of joints whose actuators have none is their D gain instead", hinge.name)
+            tree.say("joint damping becomes the D gain where the actuator has no damping", hinge.name)
     tree.say("gains are those of the file's position actuators")
     for hinge in tree.hinges:
         if hinge.driven and hinge not in stated:
-            tree.say("guess: gains of joints without a position actuator are a rule's", hinge.name)
+            tree.say("guess: a rule chooses the gains of joints without a position actuator", hinge.name)
     return stiffness, damping
 
 
 def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], feet: Sequence[str]) -> dict[str, float]:
-    """Return the deflection of each joint but wheels under the robot's weight [rad], with the base level on its feet."""
+    """Return hinge -> deflection under the robot's weight [rad] for all driven hinges but wheels. The base is level."""
     stiffness = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and not hinge.rolls}
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -133,8 +134,8 @@ def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], fee
 
 
 def growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
-    """Return the largest factor by which a deviation grows in a step of semi-implicit Euler with explicit torques -K q - D v,
-    for a free base and the pose at `angles`. The damping and armature of the joints count. K of a wheel acts on its speed.
+    """Return the largest factor by which a deviation from the pose at `angles` [rad] grows in one step of semi-implicit Euler
+    with explicit torques -K q - D v and a free base. K of a wheel acts on its speed. The joint's damping counts if D is 0.
     """
     rolls = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and hinge.rolls}
     stiffness, damping = stiffness | dict.fromkeys(rolls, 0.0), damping | rolls

@@ -20,7 +20,7 @@ URDF = ".urdf"
 
 
 def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
-    """Return a robot's model.
+    """Return the MuJoCo spec of a robot.
 
     A URDF, and MJCF that was written for another use, are adapted: everything of a scene but the robot is removed, the base
     floats, welded links are merged, driven hinges have motors in the order of the hinges, and each collision shape is a
@@ -57,7 +57,7 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tup
     """Return the MJCF of an adapted file, and one line for each change. `_stamp` renews the cache entry of a changed file."""
     tree = read_robot(path, drawn=drawn)
     bare = not tree.shapes
-    if bare and not drawn:  # the visual shapes will collide
+    if bare and not drawn:  # visual shapes are read too, because copies of them will collide
         tree = read_robot(path)
     fit_meshes(tree)
     if bare and not drawn:
@@ -84,7 +84,7 @@ def is_plain_file(path: Path) -> bool:
 
 
 def is_plain(spec: mujoco.MjSpec) -> bool:
-    """Return True if a spec is a robot alone that meets the engines' conditions: one body with a free joint on the world,
+    """Return True if a spec holds only a robot that meets the engines' conditions: one body with a free joint on the world,
     named joints below it, motors of hinges in the order of the hinges, and named collision shapes without meshes.
     """
     world = spec.worldbody

@@ -1,8 +1,8 @@
-"""Dynamics of an MJCF file that the robot's model has not. Each is reported, or refused if the robot would be another one
-without it.
+"""Dynamics of an MJCF file that the imported model lacks. They are reported; the file is refused if the robot would move
+differently without them.
 
-The model has masses, hinges with their limits, springs, damping, armature and friction loss, torque limits, gains of position
-and velocity actuators, connect and joint constraints, and the sliding friction of shapes.
+The imported model has masses, hinges with their limits, springs, damping, armature and friction loss, torque limits, gains of
+position and velocity actuators, connect and joint constraints, and the sliding friction of shapes.
 """
 
 from collections.abc import Iterator
@@ -16,27 +16,27 @@ from legged.robots.importing.tree import Tree
 POSES = 8
 """Number of poses in which lost torques are computed."""
 SHARE = 0.1
-"""Largest torque that may be left out, as a share of the motor's; of the robot's weight for the base."""
+"""Largest share of a joint's torque limit, or of the robot's weight on the base, that may be left out."""
 LEVER = 0.1
-"""Length that turns the robot's weight into a torque, for joints without a torque limit [m]."""
+"""Lever arm [m]. The robot's weight times this length stands in for the torque limit of joints without one."""
 ARRAYS = (
     ("tendons are left out", "tendon", "stiffness stiffnesspoly damping frictionloss limited armature"),
-    ("springs of joints that are not linear become linear", "jnt", "stiffnesspoly"),
-    ("damping of joints that is not linear becomes linear", "dof", "dampingpoly"),
+    ("nonlinear springs of joints become linear", "jnt", "stiffnesspoly"),
+    ("nonlinear damping of joints becomes linear", "dof", "dampingpoly"),
     ("gravity compensation is left out", "body", "gravcomp"),
     ("properties of actuators are left out", "actuator", "damping armature delay"),
 )
-"""Line, kind of element, and its properties, the arrays of MuJoCo's model that hold 0 where an element has none of it."""
+"""Line for the user, kind of element, and properties: arrays of MuJoCo's model that hold 0 for elements without them."""
 UNEVEN = "torque limits that differ by direction become the smaller one"
-FILTERS = "filters and states of actuators are left out; control.actuator.delay makes motors late"
-LAWS = "actuators that are neither motors nor position or velocity servos have another law here"
+FILTERS = "filters and states of actuators are left out; control.actuator.delay can stand in for them"
+LAWS = "actuators other than motors, position servos and velocity servos become motors with the task's control law"
 
 
 def account_for(model: mujoco.MjModel, tree: Tree) -> None:
-    """Report the dynamics of `model` that `tree`, which was read from it, has not.
+    """Report the dynamics of `model` that are left out of `tree`, which was read from it.
 
     Raises:
-        ConfigError: without them, joints would miss more than `SHARE` of their motors' torque, or muscles drive the robot.
+        ConfigError: a joint would lack more than `SHARE` of its motor's torque, or a muscle drives the robot.
     """
     left_out = list(_left_out(model))
     for line, name in left_out:
@@ -45,8 +45,8 @@ def account_for(model: mujoco.MjModel, tree: Tree) -> None:
     if lost > SHARE * whole:
         parts = "; ".join(f"{line}: {about}" for line, about in left_out)
         raise ConfigError(
-            f"{tree.source}: {name} misses up to {lost:.3g} of {whole:.3g} N m without dynamics that engines here do not have"
-            f" ({parts[:300]}); express them by stiffness and springref of joints"
+            f"{tree.source}: {name} would lack up to {lost:.3g} of {whole:.3g} N m, because engines here do not simulate"
+            f" everything in the file ({parts[:300]}); express it by stiffness and springref of joints"
         )
     for i in np.flatnonzero(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE).tolist():
         raise ConfigError(
@@ -83,8 +83,8 @@ def _left_out(model: mujoco.MjModel) -> Iterator[tuple[str, str]]:
 
 
 def _lost_torque(model: mujoco.MjModel, tree: Tree) -> tuple[str, float, float]:
-    """Return the joint that misses the largest share of its torque without the forces that are left out, with the largest
-    torque that it misses at rest, and its whole torque [N m]. The base may be meant instead, with forces [N].
+    """Return the name of the joint that loses the largest share of its torque because forces are left out, the torque that it
+    loses at rest, and its torque limit [N m]. It may be the base instead, with a lost force and the weight [N].
     """
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     named = {model.joint(i).name: model.joint(i) for i in range(model.njnt)}
@@ -107,6 +107,6 @@ def _lost_torque(model: mujoco.MjModel, tree: Tree) -> tuple[str, float, float]:
 
 
 def _name(model: mujoco.MjModel, kind: str, i: int) -> str:
-    """Return the name of an element; for a degree of freedom that of its joint."""
+    """Return the name of an element; a degree of freedom has the name of its joint."""
     number, of = (int(model.dof_jntid[i]), "jnt") if kind == "dof" else (int(i), kind)
     return getattr(model, of)(number).name or f"{of} {number}"

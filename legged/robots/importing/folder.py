@@ -16,7 +16,7 @@ from legged.robots.importing.shapes import free_name
 from legged.robots.importing.tree import Mesh, Tree
 
 ACTION_SCALE = 0.5
-"""Scale of the actions of joints that are no wheels, if wheels have another one [rad]."""
+"""Action scale of the other joints of a robot with wheels [rad]."""
 
 
 @dataclass
@@ -25,11 +25,11 @@ class Guesses:
 
     base: str
     spawn_height: float
-    """[m]"""
+    """Height of the base above the ground after a reset [m]."""
     angles: dict[str, float]
     """Angles of the driven hinges in the default pose [rad]."""
     angles_from: str
-    """Source of the angles, for a comment."""
+    """Source of these angles, for a comment in robot.yaml."""
     passive: Sequence[str]
     """Hinges without a motor."""
     feet: Sequence[str]
@@ -44,7 +44,7 @@ class Guesses:
 
 
 def called(legs: int, wheels: bool = False) -> str:
-    """Return the words for a robot with so many legs, with or without wheels."""
+    """Return words for a robot with this number of legs, such as "quadruped on wheels"."""
     return {2: "biped", 4: "quadruped"}.get(legs, f"robot with {legs} legs") + (" on wheels" if wheels else "")
 
 
@@ -52,7 +52,7 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
     """Write model, meshes, robot.yaml and PROVENANCE.md; return the size of the meshes [MiB].
 
     Raises:
-        ConfigError: a file is in place of the folder.
+        ConfigError: `folder` is a file.
         RunError: the folder can't be written.
     """
     make_folder(folder)
@@ -66,7 +66,7 @@ def write_folder(folder: Path, tree: Tree, guesses: Guesses, source: str, licenc
 
 
 def _write_meshes(folder: Path, tree: Tree) -> dict[str, Path]:
-    """Give the visual meshes unique names and write their files; return the files by name."""
+    """Give the visual meshes unique names and write their files; return name -> file."""
     known: dict[object, Mesh] = {}
     taken: set[str] = set()
     for link in tree.links:
@@ -128,8 +128,8 @@ def _table(key: str, values: dict[str, float], unit: str) -> list[str]:
 
 
 def _compact(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a table with shorter patterns: names without their first part, if the table then gives all joints the same
-    values.
+    """Return a table with shorter patterns, namely names without their first part, if each joint still gets its value; else
+    `values`.
     """
     parts = {name: name.partition("_")[2] or name for name in values}
     table = {parts[name]: value for name, value in values.items()}
@@ -141,7 +141,7 @@ def _compact(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _name(text: str) -> str:
-    """Return a text as YAML, quoted if it would not be read as text otherwise."""
+    """Return a text as YAML, in quotes if YAML would read it as something else."""
     if "\n" in text:
         return json.dumps(text)
     return dump([text], default_flow_style=True, width=10_000, allow_unicode=True).strip()[1:-1]

@@ -1,6 +1,5 @@
-"""Completion of a Tree that was read from a file: repairs, names, default pose, feet, gains; all that robot.yaml states.
-
-Every value that the file does not state is inferred, and reported as a guess.
+"""Completion of a Tree that was read from a file, until it has all that robot.yaml states: repairs, names, default pose, feet
+and gains. Values that the file does not state are inferred, and reported as guesses.
 """
 
 import re
@@ -35,17 +34,17 @@ ABOVE = 1.03
 WIDEST = 0.8
 """Largest half length of a guessed trunk, as a share of the distance from the base to the farthest foot."""
 LOST_FOOT = 0.25
-"""Largest distance of a foot from its place in a stance, as a share of the leg's length; beyond it the link is not a foot."""
+"""Largest distance of a foot from its goal in a stance, as a share of the leg's length. Links farther away are not feet."""
 LEVEL = 0.01
-"""Largest height of the lowest point of a foot above that of its leg, as a share of the leg's depth below the base."""
+"""Largest height of a foot above the lowest point of its leg, as a share of that point's depth below the base."""
 ANKLE_HEIGHT = 0.3
-"""Largest height of the hinge of a sole above the ground, as a share of the height of the standing base."""
+"""Largest height of an ankle hinge above the ground, as a share of the height of the standing base."""
 LOST = 1e-6
 """Largest share of a robot's mass that rounding may lose."""
 
 
 def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
-    """Return the robot of a URDF or MJCF file as the file has it.
+    """Return the robot of a URDF or MJCF file without repairs. For `roots` and `drawn` see `read_urdf`.
 
     Raises:
         ConfigError: the file is neither URDF nor MJCF, or holds no robot.
@@ -62,8 +61,8 @@ def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tr
 
 
 def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] | None = None) -> Guesses:
-    """Repair a tree in place and infer the values that its file does not state. `gains` [N m/rad], [N m s/rad] replace those
-    of the file.
+    """Repair a tree in place and infer the values that its file does not state. `gains`, P [N m/rad] and D [N m s/rad],
+    replace those of the file for all joints but wheels.
 
     Raises:
         ConfigError: the tree has no robot with legs, or mass was lost.
@@ -118,20 +117,20 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
 
 
 def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
-    """Return the hinges of the wheels that legs stand on, each with a scale of its actions [rad/s]: half the speed sqrt(g h)
-    of a robot that stands `height` [m] high.
+    """Return hinge -> action scale [rad/s] for the driven wheels on which legs stand. With it, action 1 drives the robot at
+    half of sqrt(g h), where h is the base's `height` [m].
     """
     found = {}
     for leg in legs:
         for hinge in (hinge for hinge in tree.links[leg.end].hinges if hinge.rolls and hinge.driven):
             found[hinge.name] = float(f"{0.5 * np.sqrt(GRAVITY * height) / max(s.size[0] for s in leg.feet):.2g}")
-            tree.say("guess: wheels, which have a velocity law, and whose angles are not observed", hinge.name)
+            tree.say("guess: hinges that turn wheels (actions are speeds, and angles are not observed)", hinge.name)
     return found
 
 
 def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool:
-    """Make all shapes of a leg's last link feet that are as low as its lowest one in the pose at `angles` [rad]; return True
-    if a leg has more feet now.
+    """Add to the feet of each leg the shapes of its last link that are about as low as the lowest of them in the pose at
+    `angles` [rad]. Return True if any leg has more feet now.
     """
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -149,8 +148,9 @@ def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool
 
 
 def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float) -> set[str]:
-    """Return the shapes that belong to a foot, whether they touch the ground or not: all of the foot's link, if it is a link
-    of its own in the file, or if its hinge is near the ground in the pose at `angles` [rad], with the base at `height` [m].
+    """Return the names of all shapes of feet, including those that do not touch the ground. A foot is the link of the file
+    that touches the ground, if it was merged into the leg's last link, or if the hinge of the last link is near the ground
+    in the pose at `angles` [rad], with the base at `height` [m].
     """
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -164,7 +164,7 @@ def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float)
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Rename the feet so that no foot's name is part of another shape's name: patterns of robot.yaml are parts of names."""
+    """Rename feet whose names are part of another shape's name: patterns in robot.yaml match all names that contain them."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}
@@ -173,15 +173,13 @@ def _name_feet(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _name_passive(tree: Tree, legs: list[Leg]) -> None:
-    """Rename the hinges without a motor so that no such name is part of another hinge's name, since patterns are parts of
-    names.
-    """
+    """Rename hinges without a motor whose names are part of a driven hinge's name (see `_name_feet`)."""
     driven = [hinge.name for hinge in tree.hinges if hinge.driven]
     for hinge in tree.hinges:
         if hinge.driven or not any(hinge.name in name for name in driven):
             continue
         old, hinge.name = hinge.name, free_name(f"{hinge.name}_passive", {other.name for other in tree.hinges})
-        tree.say("hinges without a motor whose names are parts of others' are called differently", f"{old} -> {hinge.name}")
+        tree.say("hinges without a motor are renamed if other hinges' names contain their names", f"{old} -> {hinge.name}")
         for leg in legs:
             leg.hinges = [hinge.name if name == old else name for name in leg.hinges]
         for loop in tree.loops:
@@ -191,7 +189,7 @@ def _name_passive(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
-    """Rename the shapes of a role so that none of their names is part of another shape's name; return the new names."""
+    """Rename the shapes `role` (names) whose name is part of the name of a shape not in `role`; return the new `role`."""
     named = {shape.name: shape for shape in tree.shapes}
     shapes = [named[name] for name in role]
     for shape in shapes:
@@ -199,13 +197,13 @@ def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
         if any(shape.name in name for name in others):
             taken = {other.name for other in tree.shapes}
             old, shape.name = shape.name, free_name(f"{shape.name}_itself", taken)
-            tree.say("shapes whose names are parts of others' are called differently", f"{old} -> {shape.name}")
+            tree.say("shapes are renamed if other shapes' names contain their names", f"{old} -> {shape.name}")
     return [shape.name for shape in shapes]
 
 
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
-    """Return patterns that match exactly these shapes: a part of the name that only they share, else their names. No name may
-    be part of another shape's name.
+    """Return patterns that match exactly the shapes `names`: one word if it is in all their names and in no others, else
+    their names. None of `names` may be part of another shape's name.
     """
     others = [shape.name for shape in tree.shapes if shape.name not in names]
     for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
@@ -226,7 +224,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str], of_feet: set[str]) 
     because the robot stands on them.
     """
     of_legs = {i for leg in legs for i in leg.links}
-    # the second-last link of a leg: it has the heel if the leg ends in a toe
+    # If a leg ends in a toe, its second-last link has the heel.
     before = {i for leg in legs for i in leg.links[-2:-1]}
     soles = {shape.name for i in before for shape in tree.links[i].shapes if SOLE.search(f"{shape.link} {shape.name}")}
     in_the_middle = _trunk(tree, legs)
@@ -241,7 +239,7 @@ def _roles(tree: Tree, legs: list[Leg], feet: Sequence[str], of_feet: set[str]) 
 
 
 def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
-    """Return the links of the trunk: the base, and the links in the middle that are in no leg and carry arms and a head."""
+    """Return the indices of the trunk's links: the base, and the links in the middle of the robot that belong to no leg."""
     poser = Poser(tree)
     poser.pose({})
     of_legs = {i for leg in legs for i in leg.links}
@@ -256,7 +254,7 @@ def _reach(tree: Tree, legs: list[Leg]) -> float:
 
 
 def _draw_what_is_bare(tree: Tree) -> None:
-    """Draw the collision shapes of links that have no visual shape, if other links have one."""
+    """Add visual copies of the collision shapes to links without visual shapes, if other links have visual shapes."""
     if not any(not shape.collides for link in tree.links for shape in link.shapes):
         return
     for link in tree.links:
@@ -286,11 +284,11 @@ def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
     if miss > LOST_FOOT:
         feet = ", ".join(tree.links[leg.end].name for leg in legs)
         raise ConfigError(
-            f"{tree.source}: it can't stand on {feet}: with the base level and these under its hips, one is {miss:.0%}"
-            f" of a leg's length from where it should be. Are they feet? --hold keeps joints still that are of no leg"
+            f"{tree.source}: the robot can't stand on {feet}: with the base level, one of these links stays {miss:.0%} of a"
+            f" leg's length away from its place under the hip. Are they feet? --hold can fix joints that belong to no leg"
         )
     if miss > GOOD:
-        tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length from where it should be; look at it")
+        tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length away from its place under the hip; look at it")
     return angles, "guess: a stance by inverse kinematics"
 
 
@@ -303,6 +301,6 @@ def _check_mass(tree: Tree) -> None:
     mass = float(model_of(tree).body_mass.sum())
     if abs(mass - tree.mass) > LOST * max(1.0, tree.mass):
         raise ConfigError(
-            f"{tree.source}: its links weigh {tree.mass:.6g} kg, the model {mass:.6g} kg: mass was lost on the way"
+            f"{tree.source}: the links weigh {tree.mass:.6g} kg, but the model weighs {mass:.6g} kg: the import lost mass"
         )
     tree.say(f"mass: {tree.mass:.9g} kg in the links of the file, {mass:.9g} kg in the model")

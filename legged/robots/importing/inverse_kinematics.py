@@ -12,7 +12,7 @@ from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
 from legged.robots.importing.tree import Tree, Vector
 
 STRETCH, UPRIGHT = 0.8, 0.96
-"""Distance from hip to foot as a share of the stretched leg's length, for three legs or more, and for two."""
+"""Distances from hip to foot as shares of the stretched leg's length: of robots with three legs or more, and of bipeds."""
 OUTWARD = 0.5
 """Largest sideways distance of a foot from its hip, as a share of the stretched leg's length."""
 MARGIN = 0.05
@@ -23,9 +23,9 @@ STEP = 1e-5
 GOOD = 0.05
 """Largest distance of a foot from its goal, as a share of the leg's length."""
 KNEES = 0.002
-"""Cost of a knee on the wrong side, in squared errors; smaller than the cost of joints that turn farther than needed."""
+"""Weight, in the cost, of knees on the wrong side of the hip. It is so small that it decides only between similar costs."""
 LATERAL = 0.7
-"""Least y component of the axis of a hinge that bends a leg forward."""
+"""Least absolute y component of the axis of a hinge that bends a leg forward."""
 
 
 @dataclass
@@ -35,17 +35,17 @@ class _Limb:
     leg: Leg
     partner: Leg | None
     signs: Vector
-    """(hinges,) signs of the partner's angles."""
+    """(hinges,) signs, 1 or -1, with which the partner takes the leg's angles."""
     ranges: Vector
-    """(hinges, 2) ranges of the leg's angles [rad]; with `signs` they are within the partner's ranges too."""
+    """(hinges, 2) ranges of the leg's angles [rad]. Times `signs`, they are within the partner's ranges too."""
     hip_name: str
     """First hinge that bends the leg forward."""
     hip: Vector
-    """(3,) position of that hinge at zero angles [m]."""
+    """(3,) position of the hinge `hip_name` at zero angles [m]."""
     side: float
-    """Goal of the foot along y: its place at zero angles, if the leg can stand there [m]."""
+    """Goal of the foot along y [m]: its place at zero angles, but at most `OUTWARD` from the hip."""
     knee: int
-    """Index of the link of the next such hinge."""
+    """Index of the link of the second hinge that bends the leg forward."""
     length: float
     """Distance from the hip to the foot of the stretched leg [m]."""
     level: Vector
@@ -53,17 +53,17 @@ class _Limb:
 
 
 def standing_angles(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], float]:
-    """Return joint angles [rad] by the names of the hinges, and the largest distance of a foot from its goal, as a share of
-    the leg's length.
+    """Return hinge -> angle [rad] of the stance, and the largest distance of a foot from its goal, as a share of the leg's
+    length.
     """
     poser = Poser(tree)
     limbs = _limbs(tree, legs, poser)
     free = [(limb, k) for limb in limbs for k in range(len(limb.leg.hinges))]
     lows, highs = np.array([limb.ranges[k] for limb, k in free]).T
     rest = {hinge.name: float(np.clip(0.0, *_kept(poser, hinge.name))) for hinge in tree.hinges}
-    biped = len(legs) == 2  # three legs stand like four legs, each on its own side
+    biped = len(legs) == 2  # a robot with three legs stands like one with four
     stretch = UPRIGHT if biped else STRETCH
-    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # the height at which the shortest leg stands
+    ground = max(float(limb.hip[2]) - stretch * limb.length for limb in limbs)  # the shortest leg has to reach the ground
 
     def angles(x: Vector) -> dict[str, float]:
         found = dict(rest)
@@ -133,9 +133,7 @@ def _solved(errors: Callable[[Vector], Vector], x: Vector, lows: Vector, highs: 
 
 
 def _wrong_knees(poser: Poser, limbs: list[_Limb], forward: bool) -> float:
-    """Return a cost for knees that bend the unusual way: four-legged robots' knees point backward, two-legged robots'
-    forward.
-    """
+    """Return a cost for knees on the wrong side: behind the hip if knees should point `forward`, else in front of it."""
     cost = 0.0
     for limb in limbs:
         body = poser.ids[limb.knee]
@@ -173,7 +171,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
             mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
             both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
-            if (both[:, 0] <= both[:, 1]).all():  # otherwise no pose suits both legs, and each is a limb of its own
+            if (both[:, 0] <= both[:, 1]).all():  # the two legs have angles in common
                 other, signs, ranges = legs[partner], mirrored, both
                 taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))

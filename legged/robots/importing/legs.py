@@ -20,10 +20,10 @@ HAND = re.compile(r"hand|wrist|finger|thumb|gripper|elbow|arm|shoulder|head|neck
 LEFT = ("l", "left", "fl", "hl", "bl", "lf", "lh", "lb")
 RIGHT = ("r", "right", "fr", "hr", "br", "rf", "rh", "rb")
 ANKLE = 4
-"""Number of hinges from which a leg has an ankle and a sole."""
+"""A leg with at least this number of hinges has an ankle and a sole."""
 SAMPLES = 300
 NEARLY = 0.7
-"""Least depth to which a foot reaches, as a share of the depth of the lowest foot."""
+"""Least depth below the base that a foot can reach, as a share of the depth that the lowest foot can reach."""
 
 
 @dataclass
@@ -31,9 +31,9 @@ class Leg:
     """A chain of hinges that ends in a foot."""
 
     links: list[int]
-    """Links of the tree from the base's child to the foot."""
+    """Indices of the links from the base's child to the foot."""
     hinges: list[str]
-    """Names of the hinges along the links, without that of a wheel at the end."""
+    """Names of the hinges of these links, except the hinge of a wheel at the end."""
     tip: Vector
     """(3,) lowest point of the leg, in the frame of its last link."""
     feet: list[Shape]
@@ -44,7 +44,7 @@ class Leg:
         return self.links[-1]
 
     def touch(self, shapes: list[Shape]) -> None:
-        """Make shapes of the last link the feet; their mean is the tip."""
+        """Make `shapes` of the last link the feet, and the mean of their positions the tip."""
         self.feet, self.tip = shapes, np.mean([shape.pos for shape in shapes], axis=0)
 
 
@@ -64,7 +64,7 @@ class Poser:
         self.ids = [int(self.model.body(link.name).id) for link in tree.links]
 
     def pose(self, angles: dict[str, float]) -> mujoco.MjData:
-        """Return MuJoCo's data at joint `angles` [rad]; unnamed hinges are at 0, coupled ones follow others."""
+        """Return MuJoCo's data at joint `angles` [rad]. Missing angles are 0. Coupled hinges follow their leaders."""
         self.data.qpos[:] = 0.0
         self.data.qpos[3] = 1.0
         for name, angle in self.tree.followed(angles).items():
@@ -73,7 +73,7 @@ class Poser:
         return self.data
 
     def point(self, link: int, point: Vector) -> Vector:
-        """Return the position (3,) in the frame of the base [m] of a point (3,) in the frame of a link."""
+        """Return the position (3,) of a point in the base's frame [m]; `point` (3,) is its position in the link's frame."""
         body = self.ids[link]
         return self.data.xpos[body] + self.data.xmat[body].reshape(3, 3) @ point
 
@@ -84,7 +84,7 @@ class Poser:
 
 
 def face_forward(tree: Tree) -> None:
-    """Turn a robot so that z points up and its left side to +y, as far as its legs and names tell."""
+    """Turn a robot upright along z, with its left side towards +y. Both are guessed from its legs and their names."""
     poser = Poser(tree)
     poser.pose({})
     ends = [i for i, link in enumerate(tree.links) if not tree.children(i) and not HAND.search(link.name)]
@@ -103,7 +103,7 @@ def face_forward(tree: Tree) -> None:
         quarters = round(float(np.arctan2(left[1], left[0]) / (np.pi / 2.0)))
         if np.hypot(left[0], left[1]) > 0.02 and quarters % 4 != 1:
             tree.turn(quat_about(np.array([0.0, 0.0, 1.0]), (1 - quarters) * np.pi / 2.0))
-            tree.say(f"by its names its left side is not at +y: it is turned by {(1 - quarters) * 90 % 360} degrees")
+            tree.say(f"by the names, the left side is not at +y: the robot is turned by {(1 - quarters) * 90 % 360} degrees")
 
 
 def side_of(name: str) -> int:
@@ -116,7 +116,8 @@ def side_of(name: str) -> int:
 
 
 def find_legs(tree: Tree) -> list[Leg]:
-    """Return the legs, in the order of the file: chains whose ends reach lowest, chosen by their names if these tell.
+    """Return the legs, in the order of the file: the chains whose ends reach lowest. Names of feet,
+    arms and heads tell which chains are considered.
 
     Raises:
         ConfigError: no chain, or only one, reaches below the base.
@@ -145,13 +146,13 @@ def find_legs(tree: Tree) -> list[Leg]:
     for leg in legs:
         shapes = len(tree.links[leg.end].shapes)
         leg.touch(_feet(tree, leg, flat=len(legs) == 2 and len(leg.hinges) >= ANKLE))
-        if len(tree.links[leg.end].shapes) == shapes:  # else the ball was added, and the rod is shortened
+        if len(tree.links[leg.end].shapes) == shapes:  # no ball was added as a foot
             _uncover(tree, leg)
     return legs
 
 
 def _chain(tree: Tree, end: int) -> list[int]:
-    """Return the links from the base's child to `end`."""
+    """Return the indices of the links from the base's child to `end`."""
     chain = [end]
     while tree.links[chain[0]].parent > 0:
         chain.insert(0, tree.links[chain[0]].parent)
@@ -159,7 +160,7 @@ def _chain(tree: Tree, end: int) -> list[int]:
 
 
 def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
-    """Return the largest depth of each end below the base over random poses within the limits [m]."""
+    """Return end -> largest depth [m] below the base in random poses within the joints' limits."""
     random = np.random.default_rng(0)
     lows, highs = np.array([poser.limits(name) for name in poser.places]).T
     deepest = dict.fromkeys(ends, -np.inf)
@@ -173,8 +174,8 @@ def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
 
 
 def _tip(tree: Tree, i: int) -> Vector:
-    """Return the point (3,) of a link that is farthest from its hinge, along the middle of its shapes; its centre of mass if
-    it has no shapes.
+    """Return the tip (3,) of a link: of the ends of its shapes (see `_ends`), the one farthest from the hinge. A link without
+    shapes has its tip at its centre of mass.
     """
     link = tree.links[i]
     anchor = link.hinges[0].anchor if link.hinges else np.zeros(3)
@@ -196,7 +197,7 @@ def _ends(shape: Shape) -> list[Vector]:
 
 
 def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
-    """Return the shapes of a leg's last link that touch the ground. A leg that ends in a rod gets a ball at its end."""
+    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A rod gets a ball."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
     if any(hinge.rolls for hinge in link.hinges):
@@ -219,9 +220,8 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
 
 
 def _uncover(tree: Tree, leg: Leg) -> None:
-    """Shorten the shape that was fitted to the mesh of a shank and reaches around its foot, a ball; else the shank would
-    touch the ground before the foot. The shape then ends above the centre of the foot by its own half width, so that a leg
-    can lean by 45 degrees.
+    """Shorten a shape that was fitted to one mesh of shank and foot, so that the foot, a ball, touches the ground first. The
+    shape then ends half its width above the centre of the foot, so that the leg can lean by 45 degrees.
     """
     if len(leg.feet) != 1 or leg.feet[0].kind != "sphere":
         return
@@ -234,12 +234,12 @@ def _uncover(tree: Tree, leg: Leg) -> None:
         if 0.0 < excess < shape.size[slot]:  # more than half of the shape remains
             _draw_back(shape, leg.tip, excess)
             shape.fits = {}
-            tree.say("shapes fitted to a mesh that has the foot in it end above the foot", shape.link)
+            tree.say("shapes fitted to a mesh that includes the foot are shortened to end above the foot", shape.link)
 
 
 def _long_side(shape: Shape, tip: Vector) -> tuple[Vector, int]:
-    """Return the direction (3,) of a shape's longest side towards a point (3,) of its link, and the index of the size that is
-    half that side (for a capsule, half the part between its ends).
+    """Return the direction (3,) along a shape's longest side that points towards `tip` (3,), and the index in `size` of half
+    of this side (of a capsule, half of the straight part).
     """
     half = half_lengths(shape)
     assert half is not None
@@ -257,14 +257,14 @@ def _draw_back(shape: Shape, tip: Vector, length: float) -> None:
 
 
 def _is_low(shape: Shape, leg: Leg, shapes: list[Shape]) -> bool:
-    """Return True if a shape is at the tip of a leg: at most 3 cm farther from it than the nearest shape."""
+    """Return True if a shape is at most 3 cm farther from the tip of a leg than the nearest of `shapes`."""
     nearest = min(float(np.linalg.norm(point - leg.tip)) for other in shapes for point in _ends(other))
     own = min(float(np.linalg.norm(point - leg.tip)) for point in _ends(shape))
     return own <= nearest + 0.03
 
 
 def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
-    """Add a ball to the end of a leg that is a rod, and shorten the rod by the ball's radius."""
+    """Add a ball as the foot at the tip of a leg, and shorten the rods `shapes` that end there by the ball's radius."""
     link = tree.links[leg.end]
     radius = 0.02 * float(np.linalg.norm(leg.tip)) + 1e-3
     for shape in shapes:
@@ -277,6 +277,6 @@ def _add_ball(tree: Tree, leg: Leg, shapes: list[Shape]) -> Shape:
     ball = Shape("sphere", np.array([radius, 0.0, 0.0]), leg.tip.copy(), np.array(IDENTITY), True, link.name)
     ball.name = f"{FOOT.sub('', link.name).strip('_-. ') or link.name}_foot"
     link.shapes.append(ball)
-    what = "rods" if shapes else "links that nothing touches"
-    tree.say(f"legs end in {what}, without a foot: a ball is added at the end of", link.name)
+    what = "rods" if shapes else "links without collision shapes"
+    tree.say(f"legs end in {what}, so a ball is added as the foot", link.name)
     return ball

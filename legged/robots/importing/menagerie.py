@@ -8,7 +8,7 @@ PREFIX = "menagerie:"
 
 
 def menagerie_model(name: str) -> tuple[Path, str]:
-    """Return the MJCF file of the robot `name`, without a scene, and its licence.
+    """Return the MJCF file and the licence of the robot `name`. The file contains no scene.
 
     Raises:
         ConfigError: the package is missing, or has no such robot.
@@ -27,5 +27,5 @@ def menagerie_model(name: str) -> tuple[Path, str]:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise RunError(f"{PREFIX}{name}: {' '.join(str(error).split())}") from error
     if not path.is_file():
-        raise RunError(f"{PREFIX}{name}: {path} is missing; a download may have been cut off (python -m mujoco_menagerie)")
+        raise RunError(f"{PREFIX}{name}: {path} is missing; check downloads: python -m mujoco_menagerie verify")
     return path, robot.license

@@ -1,4 +1,4 @@
-"""Mesh files: search for the file that a URDF names, reading, conversion, and the primitive that fits a mesh best."""
+"""Mesh files: finding, reading and converting them, and fitting primitives to meshes."""
 
 import re
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ from legged.robots.importing.tree import Mesh, Shape, Vector, quat_product, rota
 READ = (".stl", ".obj", ".msh")
 """Suffixes of files that MuJoCo reads."""
 MOST_FACES = 200_000
-"""Largest number of faces of an STL file that MuJoCo's decoder takes."""
+"""Largest number of faces that MuJoCo accepts in an STL file."""
 ENOUGH_FACES = 50_000
-"""Largest number of faces after a mesh with too many was simplified."""
+"""Largest number of faces of a mesh that was simplified because it had too many."""
 FINEST = 600
-"""Number of cells along the longest side of a mesh at the first attempt to simplify it."""
+"""Number of grid cells along the longest side of a mesh at the first attempt to simplify it."""
 LONGEST = 3.0
-"""Longest mesh of a legged robot [m]; a longer one is in other units."""
+"""Largest length of a mesh of a legged robot [m]; a longer mesh is probably in millimetres."""
 STL_HEADER, STL_FACE = 84, 50
 """Sizes of the header and of a face in a binary STL file [bytes]."""
 
@@ -38,8 +38,8 @@ class MeshMissing(MeshProblem):
 
 
 def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
-    """Return the file that a URDF in `folder` calls `name`: a path, `file://` or `package://`. Packages are searched in the
-    folders above and in `roots`.
+    """Return the mesh file that a URDF in `folder` names. `name` is a path, or begins with `file://` or `package://`.
+    Packages are searched in `folder`, in the folders above it, and in `roots`.
 
     Raises:
         MeshMissing: there is no such file.
@@ -47,7 +47,7 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
     parts = [part for part in Path(path).parts if part not in ("/", "\\")]
     places = [folder, *folder.parents, *roots]
-    # shorter tails leave out the package, or the home folder of another machine
+    # Shorter tails lack the name of the package, or the first folders of a path on another machine.
     tails = [parts[i:] for i in range(len(parts))]
     options = [Path(path)] if Path(path).is_absolute() else [folder / path]
     options += [place.joinpath(*tail) for tail in tails[:2] for place in places]
@@ -59,11 +59,11 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
         found = ignoring_case(option)
         if found is not None:
             return found.resolve()
-    raise MeshMissing(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+    raise MeshMissing(f"mesh '{name}' was not found in {folder.name}/ or the folders around it")
 
 
 def ignoring_case(path: Path) -> Path | None:
-    """Return the file or folder at `path`, in upper or lower case; None if it does not exist."""
+    """Return the file or folder whose path is `path`, except for upper and lower case; None if it does not exist."""
     if path.exists() or path.parent == path:
         return path if path.is_file() or path.is_dir() else None
     folder = ignoring_case(path.parent)
@@ -73,8 +73,8 @@ def ignoring_case(path: Path) -> Path | None:
 
 
 def find_by_name(name: str, folder: Path) -> Path:
-    """Return the only file with the file name of `name` in folders within `folder` or next to it, for files whose paths are
-    wrong.
+    """Return the only file with the file name of `name` in the subfolders of `folder` and the folders next to it. This finds
+    meshes whose paths in a URDF are wrong.
 
     Raises:
         MeshMissing: there is no such file, or there are several.
@@ -83,12 +83,13 @@ def find_by_name(name: str, folder: Path) -> Path:
     patterns = [(folder, f"{deep}{last}") for deep in ("*/", "*/*/")] + [(folder.parent, f"*/{last}")]
     found = {path.resolve() for place, pattern in patterns if last for path in place.glob(pattern) if path.is_file()}
     if len(found) != 1:
-        raise MeshMissing(f"mesh '{name}' is not to be found beside {folder.name}/ or above it")
+        raise MeshMissing(f"mesh '{name}' was not found in {folder.name}/ or the folders around it")
     return found.pop()
 
 
 def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
-    """Return the meshes of a file in a form that MuJoCo reads, each with its colour (4,) or None.
+    """Return the meshes of a file, with the factors `scale` (3,), in a form that MuJoCo reads. Each has its colour (4,) or
+    None.
 
     Raises:
         MeshProblem: MuJoCo does not read the file, and it can't be converted.
@@ -106,8 +107,8 @@ def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
 
 
 def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
-    """Return vertices (V, 3) and faces (T, 3) of a mesh with few enough faces for MuJoCo; in a mesh with too many, vertices
-    near each other are merged.
+    """Return the vertices (V, 3) and the faces (T, 3) of a mesh. If it has too many faces for MuJoCo, vertices near each
+    other are merged.
     """
     cells = FINEST
     low, extent = vertices.min(axis=0), max(float(np.ptp(vertices, axis=0).max()), 1e-9)
@@ -125,7 +126,7 @@ def _thinned(vertices: Vector, faces: Vector) -> tuple[Vector, Vector]:
 
 @cache
 def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
-    """Return vertices (V, 3), faces (T, 3) and colour of each part of a file, read by trimesh."""
+    """Read a file with trimesh, and return the vertices (V, 3), the faces (T, 3) and the colour of each part."""
     try:
         import trimesh
     except ImportError as error:
@@ -141,10 +142,10 @@ def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
 
 
 def _colour(part: Any) -> Vector | None:
-    """Return the colour (4,) of a part, or None if it has not exactly one."""
+    """Return the colour (4,) of a part; None if it has no single colour or is invisible."""
     try:
         rgba = np.array(part.visual.to_color().main_color, dtype=float) / 255.0
-    except Exception:  # such as a missing texture
+    except Exception:  # for example, because a texture is missing
         return None
     return rgba if rgba.shape == (4,) and rgba[3] > 0.0 else None
 
@@ -169,8 +170,8 @@ ROUND = 1.25
 
 
 def fitted(shape: Shape) -> Shape:
-    """Return the primitive around the mesh of a shape: the smallest of those that MuJoCo fits to its bounding box; a sphere
-    only for a round mesh.
+    """Return a shape with a primitive in place of its mesh: the smallest of those that MuJoCo fits to the mesh's bounding
+    box. Only a round mesh becomes a sphere.
 
     Raises:
         MeshProblem: MuJoCo refuses the mesh.
@@ -187,23 +188,23 @@ def fitted(shape: Shape) -> Shape:
 
 
 def check_length(source: Path, shape: Shape, points: Vector | None) -> None:
-    """Check that the mesh of a shape is not too long for a part of a legged robot, given its vertices (V, 3), and the file of
-    the robot for the error.
+    """Check that a mesh is not too long for a legged robot. `points` (V, 3) are its vertices [m]. The robot's file `source`
+    and the shape are named in the error message.
 
     Raises:
-        ConfigError: it is too long.
+        ConfigError: the mesh is longer than `LONGEST`.
     """
     length = 0.0 if points is None or not len(points) else float(np.ptp(points, axis=0).max())
     if length > LONGEST:
         name = shape.mesh.file.name if shape.mesh is not None and shape.mesh.file is not None else shape.name
         raise ConfigError(
-            f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; one in millimetres needs"
+            f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; if it is in millimetres, add"
             ' scale="0.001 0.001 0.001"'
         )
 
 
 def vertices(mesh: Mesh) -> Vector | None:
-    """Return the vertices (V, 3) of a mesh [m] if they are cheap to read, as those of a binary STL file."""
+    """Return the vertices (V, 3) of a mesh [m] in memory or in a binary STL file; None for files that take long to read."""
     if mesh.file is None or mesh.file.suffix.lower() != ".stl":
         return mesh.vertices
     face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
@@ -212,21 +213,21 @@ def vertices(mesh: Mesh) -> Vector | None:
 
 
 def rounded(shape: Shape) -> Shape:
-    """Return a primitive that was fitted to a mesh as a sphere or capsule, if one of them fits: point feet roll."""
+    """Return a shape as the sphere or capsule, whichever is smaller, that was fitted to its mesh: point feet are round."""
     options = [kind for kind in ("capsule", "sphere") if kind in shape.fits]
     return refitted(shape, min(options, key=lambda kind: _volume(kind, shape.fits[kind][0]), default=shape.kind))
 
 
 def refitted(shape: Shape, kind: str) -> Shape:
-    """Return a primitive that was fitted to a mesh as a primitive of kind `kind`, if one fits."""
+    """Return a shape as the primitive of kind `kind` that was fitted to its mesh; unchanged if there is no such primitive."""
     size, pos, quat = shape.fits.get(kind, (shape.size, shape.pos, shape.quat))
     kind = kind if kind in shape.fits else shape.kind
     return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())
 
 
 def _fits(mesh: Mesh) -> tuple[dict[str, tuple[Vector, Vector, Vector]], Vector]:
-    """Return the primitives that MuJoCo fits to a mesh: kind -> size (3,), position (3,) and orientation (4,). A flat mesh
-    has no capsule. The second value is the mesh's vertices (V, 3) [m].
+    """Return kind -> size (3,), position (3,) and orientation (4,) of the primitives that MuJoCo fits to a mesh, and the
+    mesh's vertices (V, 3) [m]. No capsule fits a flat mesh.
     """
     found: dict[str, tuple[Vector, Vector, Vector]] = {}
     problem: Exception | None = None

@@ -49,8 +49,8 @@ def read_mjcf(path: Path, drawn: bool = True) -> Tree:
 
 
 def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True, said: Sequence[tuple[str, str]] = ()) -> Tree:
-    """Return the heaviest robot in a spec, which is changed in place; `path` is the file that it was read from. `said` are
-    lines about changes on the way, each with what it is about.
+    """Return the heaviest robot in a spec that was read from the file `path`; the spec is changed in place. `said` are lines
+    about changes made while reading, each with the name of the thing that was changed.
 
     Raises:
         ConfigError: MuJoCo refuses the spec, or no body in it moves.
@@ -71,8 +71,8 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True, said: Sequence[
 
 
 def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoco.MjModel:
-    """Compile the parts of a spec that a robot consists of. Sensors and contact pairs are removed first, because in a
-    fragment they may refer to elements of another file.
+    """Compile the parts of a spec that a robot consists of. Sensors and contact pairs are removed first, because they may
+    refer to elements of a file that includes this one.
     """
     _name_joints(spec)
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
@@ -89,7 +89,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.meshname in missing:
             spec.delete(geom)
     if missing:
-        tree.say(f"{len(missing)} meshes are not beside the file and left out: {', '.join(sorted(missing))[:200]}")
+        tree.say(f"{len(missing)} mesh files do not exist, and the meshes are left out: {', '.join(sorted(missing))[:200]}")
     if not drawn:
         drop_visual_meshes(spec, path)
     used = {geom.meshname for geom in spec.geoms if geom.meshname}
@@ -99,7 +99,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     try:
         return spec.compile()
     except Exception as error:
-        for key in list(spec.keys):  # keyframes of another size belong to a scene with more joints
+        for key in list(spec.keys):  # keyframes of a scene with more joints may be the reason
             spec.delete(key)
         try:
             return spec.compile()
@@ -108,7 +108,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
 
 
 def _name_joints(spec: mujoco.MjSpec) -> None:
-    """Name unnamed joints of bodies with several: the first one takes the name of its body."""
+    """Name the unnamed joints of each body except the first one, which is called `<body>_joint` later."""
     taken = {joint.name for joint in spec.joints}
     for body in spec.bodies[1:]:
         for joint in [joint for joint in body.joints if not joint.name][1:]:
@@ -117,8 +117,8 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
 
 
 def drop_visual_meshes(spec: mujoco.MjSpec, path: Path) -> None:
-    """Remove the visual meshes of a spec that was read from `path`, where their files exist and no mass is computed from
-    them; reading them would take most of the time.
+    """Remove visual meshes from a spec that was read from `path`, because reading them takes most of the time. Meshes with
+    missing files and meshes from which a mass is computed stay.
     """
     folder = path.parent / (spec.meshdir or "")
     there = {mesh_name(mesh) for mesh in spec.meshes if mesh.file and (folder / mesh.file).is_file()}
@@ -139,13 +139,13 @@ def mesh_name(mesh: mujoco.MjsMesh) -> str:
 
 
 def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
-    """Return the body that carries the robot: the heaviest body on the world with a hinge below it."""
+    """Return the robot's base: of the bodies on the world that have a hinge below them, the one that carries most mass."""
     turned = [int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]]
     moved = {root for body in turned if (root := int(model.body_rootid[body])) != body}
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
     able = [body for body in tops if body in moved]
     if not able:
-        raise ConfigError(f"{path}: nothing in it turns: no body that hangs on another one has a hinge")
+        raise ConfigError(f"{path}: holds no robot: no body that hangs on another body has a hinge")
     root = max(able, key=lambda body: float(model.body_subtreemass[body]))
     if model.body_subtreemass[root] <= 0.0:
         raise ConfigError(f"{path}: body '{_name(model, root)}' and what hangs on it have no mass")
@@ -168,8 +168,8 @@ def _name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, Mesh], drawn: bool) -> None:
-    """Append the links of `root` and all bodies below it. The frame of the base is turned upright, which is its orientation
-    in the file's world.
+    """Append the links of `root` and all bodies below it. The axes of the base's frame become parallel to those of the
+    file's world.
     """
     places: dict[int, int] = {}
     for body in (b for b in range(1, model.nbody) if model.body_rootid[b] == root):
@@ -205,17 +205,17 @@ def _turn_upright(base: Link) -> None:
 
 
 def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> None:
-    """Add the hinges of a body to `link`, with angles counted from the pose in the file; joints of other types are held."""
+    """Add the hinges of a body to `link`. Their angles are MuJoCo's joint positions. Joints of other types are held."""
     for i in (i for i in range(model.njnt) if model.jnt_bodyid[i] == body):
         name = model.joint(i).name or f"{link.name}_joint"
         kind = mujoco.mjtJoint(int(model.jnt_type[i]))
         if kind != mujoco.mjtJoint.mjJNT_HINGE:
             what = {mujoco.mjtJoint.mjJNT_SLIDE: "slide", mujoco.mjtJoint.mjJNT_BALL: "are balls"}.get(kind, "float")
-            tree.say(f"joints that {what} are no hinges, and held where they are at 0", name)
+            tree.say(f"joints that {what} are no hinges; they are held at position 0", name)
             continue
         dof, drawn_at = int(model.jnt_dofadr[i]), float(model.qpos0[model.jnt_qposadr[i]])
         hinge = Hinge(name, model.jnt_axis[i].copy(), model.jnt_pos[i].copy(), driven=False)
-        if drawn_at:  # a joint with a `ref` is at that angle in MuJoCo's pose
+        if drawn_at:  # in the file's pose, the joint is at this angle (`ref`)
             turn_link(link, hinge, -drawn_at)
         if model.jnt_limited[i]:
             hinge.range = (float(model.jnt_range[i, 0]), float(model.jnt_range[i, 1]))
@@ -236,19 +236,19 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
 
 
 def _smaller(limits: np.ndarray) -> float | None:
-    """Return the end of a range that is nearer to 0, or the farther end if the nearer one is 0; None if the result is not a
-    finite limit.
+    """Return the size of the limit that is nearer to 0, or of the other limit if that one is 0. Return None if the result is
+    0 or too large.
     """
     size = float(min(abs(limits[0]), abs(limits[1])) or max(abs(limits[0]), abs(limits[1])))
     return size if 0.0 < size < 1e5 else None
 
 
 def _shape(model: mujoco.MjModel, geom: int, link: str, meshes: dict[int, Mesh], tree: Tree) -> Shape | None:
-    """Return a geom as a shape of `link`; None for a type that bodies cannot have."""
+    """Return a geom as a shape of `link`; None for types that are left out, such as planes."""
     kind = KINDS.get(mujoco.mjtGeom(int(model.geom_type[geom])))
     collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
     if kind is None:
-        tree.say(f"a {mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()} is left out, of link", link)
+        tree.say(f"a {mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()} is left out, on link", link)
         return None
     size = np.where(np.arange(3) < SIZED[kind], model.geom_size[geom], 0.0)
     pos, quat = model.geom_pos[geom].copy(), model.geom_quat[geom].copy()
@@ -288,7 +288,7 @@ def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
 
 
 def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int, Mesh]:
-    """Return the meshes of a model by their ids: files, or vertices for meshes that the MJCF itself holds."""
+    """Return id -> mesh of a model. A mesh has a file, or vertices if the MJCF itself states or moves them."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
@@ -325,7 +325,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
             anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                turned = [  # in the turned frame of the base
+                turned = [  # the frame of the base was turned, and so are the anchors in it
                     rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
                     for body, name, anchor in zip(bodies, names, anchors, strict=True)
                 ]
@@ -341,7 +341,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
                     {"tag": "joint", **ends, "polycoef": text_of(_coupling(data[:5], first, *second)), **solver}
                 )
                 continue
-        tree.say(f"a constraint ({kind.name[5:].lower()}) is left out: engines here know connect and joint between hinges")
+        tree.say(f"a constraint ({kind.name[5:].lower()}) is left out: only connect, and joint between hinges, are supported")
 
 
 def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
@@ -354,8 +354,8 @@ def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
 
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:
-    """Return the polynomial (5,) of the second hinge's angle for the first hinge's angle [rad]. MuJoCo's coefficients
-    `factors` are for angles counted from the `ref` of both joints.
+    """Return the coefficients (5,) of the polynomial that gives the first hinge's angle from the second's [rad]. MuJoCo's
+    coefficients `factors` are for angles relative to the `ref` of each joint, `first` and `second`.
     """
     polynomial = first + np.polynomial.Polynomial(factors)(np.polynomial.Polynomial([-second, 1.0]))
     return np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))

@@ -11,8 +11,8 @@ MOST = 1e5
 
 
 def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
-    """Set the torque limits and gains of the hinges that have actuators, as seen by the joint, and mark the others as not
-    driven. In a file without actuators all hinges are driven.
+    """Set the torque limits and gains of the hinges that have actuators, at the joint (after the gear), and mark these hinges
+    as driven. In a file without actuators, all hinges are driven.
     """
     hinges = {hinge.name: hinge for hinge in tree.hinges}
     for i in range(model.nu):
@@ -21,7 +21,7 @@ def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
         if mujoco.mjtTrn(int(model.actuator_trntype[i])) in ON_JOINTS:
             name = model.joint(joint).name or f"{model.body(model.jnt_bodyid[joint]).name}_joint"
         if name not in hinges:
-            tree.say("actuators of no single hinge are left out", model.actuator(i).name or str(i))
+            tree.say("actuators that drive something other than one hinge are left out", model.actuator(i).name or str(i))
             continue
         _read_actuator(model, i, hinges[name])
     if not any(hinge.driven for hinge in hinges.values()):
@@ -30,7 +30,7 @@ def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
         tree.say("the file has no actuators: every hinge is given a motor")
     for hinge in hinges.values():
         if not hinge.driven:
-            tree.say("hinges without a motor stay without", hinge.name)
+            tree.say("hinges that have no motor stay passive", hinge.name)
 
 
 def _read_actuator(model: mujoco.MjModel, i: int, hinge: Hinge) -> None:

@@ -1,4 +1,4 @@
-"""Text of an MJCF file as MuJoCo parses it: any suffix, without settings that this version of MuJoCo does not know."""
+"""Parsing of MJCF files with any suffix. Settings that this version of MuJoCo does not know are left out."""
 
 import os
 import re
@@ -13,10 +13,10 @@ from legged.robots.importing.meshes import ignoring_case
 SETTINGS = ("option", "flag", "compiler", "size", "statistic", "global", "quality", "headlight", "map", "scale", "rgba")
 """Elements whose attributes may be left out: the task has settings of its own."""
 UNKNOWN = re.compile(r"unrecognized attribute: '([^']+)'\s+Element '([^']+)'")
-"""MuJoCo's error about an attribute, and about its element."""
+"""MuJoCo's error about an unknown attribute. Its groups are the names of the attribute and of the element."""
 
 Said = list[tuple[str, str]]
-"""Lines about changes, each with what it is about."""
+"""Lines about changes, each with the name of the thing that was changed."""
 
 
 def read_spec(path: Path) -> tuple[mujoco.MjSpec, Said]:
@@ -36,7 +36,7 @@ def read_spec(path: Path) -> tuple[mujoco.MjSpec, Said]:
     for mesh in (mesh for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()):
         found = ignoring_case(folder / mesh.file)
         if found is not None and found.is_file():
-            said.append(("meshes whose names differ in upper and lower case are taken", f"{mesh.file} -> {found.name}"))
+            said.append(("mesh files are found only in other upper and lower case", f"{mesh.file} -> {found.name}"))
             mesh.name, mesh.file = mesh.name or Path(mesh.file).stem, os.path.relpath(found, folder)
     return spec, said
 
@@ -74,7 +74,7 @@ def _from_text(path: Path, said: Said) -> mujoco.MjSpec:
 
 
 def _include(root: ET.Element, folder: Path) -> None:
-    """Put the contents of included files in the places of their <include> elements."""
+    """Replace <include> elements by the contents of the files that they name."""
     for parent in list(root.iter()):
         for i, element in reversed(list(enumerate(parent))):
             if element.tag == "include":

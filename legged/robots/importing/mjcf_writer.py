@@ -13,12 +13,10 @@ from legged.errors import ConfigError
 from legged.robots.importing.tree import IDENTITY, Hinge, Link, Mesh, Shape, Tree, Vector, quat_product, rotate, vector_of
 
 DRAWN_GROUP, TOUCHED_GROUP = 2, 3
-"""Groups of geoms: pictures show only the first."""
+"""Groups of visual and of collision geoms. Pictures show only the visual ones."""
 GREY = "0.7 0.7 0.72 1"
 DRAWN_APART = 1e-6
-"""Largest distance of two points of a constraint from each other at zero joint angles [m]; a constraint with a larger one
-uses sites.
-"""
+"""Largest distance between the two points of a constraint at zero joint angles [m]. If it is larger, sites are needed."""
 
 
 def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
@@ -80,7 +78,7 @@ def model_of(tree: Tree) -> mujoco.MjModel:
 
 
 def numbers(values: Vector) -> str:
-    """Return numbers as text of MJCF, with nine digits each."""
+    """Return numbers as text of MJCF, with up to nine digits each."""
     return " ".join(f"{value:.9g}" for value in np.where(np.abs(values) < 1e-12, 0.0, values))
 
 
@@ -90,13 +88,13 @@ def _touched_colour(group: int) -> str:
 
 def _mesh(mesh: Mesh, file: Path) -> str:
     scale = "" if mesh.file is None or np.allclose(mesh.scale, 1.0) else f' scale="{numbers(mesh.scale)}"'
-    # Visual meshes have no mass; inertia="shell" makes MuJoCo accept one without a volume too.
+    # inertia="shell" makes MuJoCo accept meshes without a volume. It changes no masses, as visual meshes have none.
     return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
 
 
 def _loop_ends(tree: Tree) -> dict[str, list[tuple[str, str]]]:
-    """Return the sites of constraints, name and position, by link. MuJoCo ties two bodies together at the point where they
-    are at zero joint angles; a constraint whose points are apart there needs a site on each link.
+    """Return link -> sites (name, position) of the constraints that need sites. MuJoCo assumes that the two points of a
+    constraint coincide at zero joint angles. If they do not, the constraint needs a site on each link.
     """
     places: list[tuple[Vector, Vector]] = []
     for link in tree.links:

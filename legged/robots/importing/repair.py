@@ -19,24 +19,24 @@ from legged.robots.importing.tree import (
 )
 
 LEAST_SHARE = 0.01
-"""Share of its heaviest child's mass that a massless link is given."""
+"""Mass that a massless link is given, as a share of the mass of its heaviest child."""
 LEAST_MOMENT = 1e-3
-"""Smallest principal moment of inertia, as a share of the largest, for a link with a moment that is not above 0."""
+"""Principal moments of inertia that are not above 0 are raised to this share of the largest one."""
 LARGEST = 1e6
 """Largest mass [kg], inertia [kg m^2] and length [m]; a larger number is a mistake in the file."""
 FINGERS = re.compile(r"hand|finger|thumb|index|middle|ring|pinky|little|gripper|palm|eye|ear|jaw|antenna", re.IGNORECASE)
 """Pattern in the names of joints and links that walking does not need."""
 ROUNDING = 1e-6
-"""Distance of the moments from the limit A + B = C, as a share of the largest moment."""
+"""Margin A + B - C of repaired principal moments A <= B <= C, as a share of C."""
 TINY = 1e-12
 """Principal moments [kg m^2] and masses [kg] below this count as zero."""
 
 
 def repair(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
-    """Repair a tree in place: hold joints, weld links without mass, merge welded links, correct inertias.
+    """Repair a tree in place: hold joints, merge welded links, give massless links a mass, correct inertias.
 
-    The held joints are those whose names contain a pattern of `hold`, and those of fingers that move less than the share
-    `light` of the mass.
+    A held joint is fixed at its rest angle. Joints are held if their names contain a pattern of `hold`, or if they belong to
+    fingers and move less than the share `light` of the mass.
 
     Raises:
         ConfigError: a pattern of `hold` matches no joint, or there is no mass.
@@ -55,11 +55,7 @@ def repair(tree: Tree, hold: Sequence[str] = (), light: float = 0.0) -> None:
 
 
 def _check_numbers(tree: Tree) -> None:
-    """Check that the squares of masses, inertias, lengths and positions do not overflow.
-
-    Raises:
-        ConfigError: a number is not finite or too large.
-    """
+    """Check that masses, inertias, lengths and positions are finite and at most `LARGEST`."""
     for link in tree.links:
         values = np.hstack([link.mass, link.com, link.inertia.ravel(), link.pos, link.quat])
         sizes = [np.hstack([shape.size, shape.pos, shape.quat]) for shape in link.shapes]
@@ -77,7 +73,7 @@ def _hold(tree: Tree, hold: Sequence[str]) -> None:
         for hinge in [hinge for hinge in link.hinges if any(pattern in hinge.name for pattern in hold)]:
             angle = rest_angle(tree, hinge)
             fix(link, hinge, angle)
-            tree.say("joints are held as asked", f"{hinge.name} at {angle:.3g} rad")
+            tree.say("joints are held because of --hold", f"{hinge.name} at {angle:.3g} rad")
 
 
 def fix(link: Link, hinge: Hinge, angle: float) -> None:
@@ -87,8 +83,8 @@ def fix(link: Link, hinge: Hinge, angle: float) -> None:
 
 
 def _hold_what_is_light(tree: Tree, light: float, at: Mapping[str, float]) -> None:
-    """Hold joints that move no mass, neither their own link's nor another's, joints of fingers, which are recognised by name
-    and mass, and light joints that mimic others, at the angles `at` [rad]. Without `light`, all that mimic others are held.
+    """Hold joints that move no mass, joints of fingers, and joints that mimic others. Fingers are recognised by their names
+    and their mass. Mimicking joints are held at the angles `at` [rad], if they are light or if `light` is 0.
     """
     moved = [link.mass for link in tree.links]
     for i in reversed(range(1, len(tree.links))):
@@ -108,7 +104,7 @@ def _hold_what_is_light(tree: Tree, light: float, at: Mapping[str, float]) -> No
 
 
 def _hold_followers(tree: Tree, at: Mapping[str, float]) -> None:
-    """Hold the hinges without a motor that follow hinges which are held, at the angles `at` [rad]: nothing moves them."""
+    """Hold hinges without a motor if the hinge that they follow is held. They stay at the angles `at` [rad]."""
     names = {hinge.name for hinge in tree.hinges}
     coupled = [loop for loop in tree.loops if loop["tag"] == "joint" and "joint2" in loop]
     followers = {loop["joint1"] for loop in coupled if loop["joint2"] not in names}
@@ -119,13 +115,13 @@ def _hold_followers(tree: Tree, at: Mapping[str, float]) -> None:
 
 
 def rest_angle(tree: Tree, hinge: Hinge) -> float:
-    """Return the angle [rad] at which a joint is held: the keyframe's, else the angle in its range nearest to 0."""
+    """Return the angle [rad] at which a joint is held: the keyframe's, else 0, clipped to the joint's range."""
     return float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
 
 
 def merge_welded(tree: Tree) -> None:
-    """Merge every link without a hinge into its parent: mass, centre of mass, inertia and shapes. A shape keeps the name of
-    its first link.
+    """Merge every link without a hinge into its parent: mass, centre of mass, inertia and shapes. The field `link` of a shape
+    stays as in the file.
     """
     merged = 0
     for i in reversed(range(1, len(tree.links))):
@@ -165,9 +161,9 @@ def _drop_loops(tree: Tree) -> None:
     for loop in list(tree.loops):
         ends = [loop[key] for key in ("body1", "body2", "joint1", "joint2") if key in loop]
         if loop["tag"] == "connect" and len(set(ends)) == 1:
-            tree.say("constraints between links that are welded to each other are left out, of link", ends[0])
+            tree.say("constraints between links that are welded to each other are left out", ends[0])
         elif loop["tag"] == "joint" and not set(ends) <= hinges:
-            tree.say("constraints of joints that are held are left out, of", " and ".join(ends))
+            tree.say("constraints of held joints are left out", " and ".join(ends))
         else:
             continue
         tree.loops.remove(loop)
@@ -197,13 +193,13 @@ def _give_mass(tree: Tree) -> None:
             continue
         child = max((tree.links[j] for j in tree.children(i)), key=lambda other: other.mass)
         mass, inertia = LEAST_SHARE * child.mass, LEAST_SHARE * np.eye(3) * np.trace(child.inertia) / 3.0
-        what = f"links that move and have no mass are given {LEAST_SHARE:.0%} of that of the next one"
+        what = f"moving links that have no mass are given {LEAST_SHARE:.0%} of the next link's mass"
         tree.say(what, f"{link.name} {mass:.3g} kg of {child.name}")
         add_mass(link, mass, child.pos, inertia)
         child.mass, child.inertia = child.mass - mass, (1.0 - LEAST_SHARE) * child.inertia
     base = tree.links[0]
     if base.mass <= TINY:
-        raise ConfigError(f"{tree.source}: the base, link '{base.name}', has no mass, and nothing is welded to it that has")
+        raise ConfigError(f"{tree.source}: the base, link '{base.name}', and the links that are welded to it have no mass")
 
 
 def _mend_inertia(link: Link, tree: Tree) -> None:
@@ -215,14 +211,14 @@ def _mend_inertia(link: Link, tree: Tree) -> None:
         else:
             link.inertia = link.mass / 12.0 * np.diag((sides**2).sum() - sides**2)
         what = "box around their shapes" if sides is not None else "ball of water"
-        tree.say(f"links with a mass and no inertia are given that of a {what} of their mass", link.name)
+        tree.say(f"links with a mass but no inertia are given the inertia of a {what} with this mass", link.name)
         return
     moments, axes = np.linalg.eigh((link.inertia + link.inertia.T) / 2.0)
     wanted = np.maximum(moments, LEAST_MOMENT * np.abs(moments).max())
     excess = max(0.0, wanted[2] - wanted[0] - wanted[1])
     if moments[0] > 0.0 and wanted[0] + wanted[1] >= wanted[2] * (1.0 + ROUNDING):
         return
-    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # flat bodies: rounded numbers in the file break the limit
+    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # a flat body whose rounded moments break the limit slightly
         link.inertia = axes @ np.diag(wanted + np.array([1.0, 1.0, 0.0]) * ROUNDING * wanted[2]) @ axes.T
         return
     said = ", ".join(f"{moment:.3g}" for moment in moments)
@@ -234,7 +230,7 @@ def _mend_inertia(link: Link, tree: Tree) -> None:
 
 
 def _radius(mass: float) -> float:
-    """Return the radius of a ball of water of this mass [m]."""
+    """Return the radius [m] of a ball of water that has the mass `mass` [kg]."""
     return float((3.0 * mass / (4000.0 * np.pi)) ** (1 / 3))
 
 

@@ -14,7 +14,7 @@ THINNEST = 0.02
 
 
 def fit_meshes(tree: Tree) -> None:
-    """Replace the collision meshes of a tree by primitives, in place. If no shape collides, the visual shapes do."""
+    """Replace the collision meshes of a tree by primitives, in place. If no shape collides, copies of visual shapes do."""
     if not tree.shapes:
         _let_the_drawn_collide(tree)
     for link in tree.links:
@@ -41,7 +41,7 @@ def count_fitted(tree: Tree) -> None:
 
 def _let_the_drawn_collide(tree: Tree) -> None:
     """Add a collision copy of each visual shape."""
-    tree.say("no shape collides: those that are drawn do")
+    tree.say("no shape collides, so copies of the visual shapes do")
     for link in tree.links:
         link.shapes += [
             Shape(s.kind, s.size.copy(), s.pos.copy(), s.quat.copy(), True, s.link, s.name, s.mesh, friction=s.friction)
@@ -50,7 +50,7 @@ def _let_the_drawn_collide(tree: Tree) -> None:
 
 
 def give_trunk(tree: Tree, widest: float) -> None:
-    """Add a collision box to the base that has the base's inertia, with half lengths of at most `widest` [m]."""
+    """Add to the base a collision box with the base's inertia. Its half lengths are at most `widest` [m]."""
     base = tree.links[0]
     moments, axes = np.linalg.eigh(base.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -60,17 +60,17 @@ def give_trunk(tree: Tree, widest: float) -> None:
     mujoco.mju_mat2Quat(quat, axes.ravel())
     size = np.clip(half, THINNEST * widest, widest)
     base.shapes.append(Shape("box", size, base.com.copy(), quat, True, base.name))
-    tree.say("guess: nothing of the trunk collides, so the box that has the base's inertia does")
+    tree.say("guess: the trunk has no collision shapes, so a box with the base's inertia is added")
 
 
 def name_shapes(tree: Tree) -> None:
-    """Give each collision shape a unique name that the scene does not need: its own name, else its link's."""
+    """Give each collision shape a unique name that the scene does not need: its own name, else the name of its link."""
     taken: set[str] = set()
-    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # shapes with a name keep it
+    shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # named shapes come first and keep their names
     for shape in shapes:
         wanted = re.sub(r"[\s/]+", "_", shape.name or shape.link) or "shape"
         if re.fullmatch(RESERVED["geom"], wanted):
-            tree.say("shapes whose names the scene needs are called as their links", f"{wanted} -> {shape.link}")
+            tree.say("shapes with names that the scene needs are named after their links", f"{wanted} -> {shape.link}")
             wanted = shape.link
         shape.name = free_name(wanted, taken)
         taken.add(shape.name)

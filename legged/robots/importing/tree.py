@@ -1,4 +1,4 @@
-"""A robot between files: links on hinges, with masses, shapes and motors, whatever format they were read from."""
+"""A robot as a tree of links on hinges, with masses, shapes and motors. It does not depend on the format of the file."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ MOST_NAMED = 12
 
 @dataclass
 class Mesh:
-    """A triangle mesh: a file that MuJoCo reads, or the vertices and faces of one that it does not read."""
+    """A triangle mesh: a file that MuJoCo reads, or vertices and faces."""
 
     name: str
     file: Path | None = None
@@ -43,7 +43,7 @@ class Shape:
     rgba: Vector | None = None
     friction: Vector | None = None
     fits: dict[str, tuple[Vector, Vector, Vector]] = field(default_factory=dict)
-    """Other primitives that fit the mesh: kind -> size, position and orientation."""
+    """Primitives that were fitted to the mesh: kind -> size, position and orientation."""
     points: Vector | None = None
     """(V, 3) vertices of the mesh that a collision shape was fitted to [m]."""
 
@@ -72,7 +72,7 @@ class Hinge:
     driven: bool = True
     """True if the hinge has a motor."""
     mimics: bool = False
-    """True if a URDF lets the hinge follow another one."""
+    """True if the hinge follows another one by a `mimic` element of a URDF."""
     rolls: bool = False
     """True if the hinge carries a wheel, which turns without limits."""
     stiffness: float | None = None
@@ -123,7 +123,7 @@ class Tree:
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
-        """Record a line for the user. Lines with the same text become one that lists everything in `about`."""
+        """Record a line for the user. Lines with the same text become one line, which lists all their `about`."""
         names = self._said.setdefault(line, [])
         if about and about not in names:
             names.append(about)
@@ -134,12 +134,12 @@ class Tree:
         return [f"{line}: {listed(names)}" if names else line for line, names in self._said.items()]
 
     def couple(self, follower: str, leader: str, factors: Sequence[float]) -> None:
-        """Let a hinge follow another one: its angle is the polynomial with these `factors`, lowest power first [rad]."""
+        """Couple hinges: the follower's angle [rad] is a polynomial of the leader's; `factors` has the lowest power first."""
         polynomial = " ".join(f"{factor:.15g}" for factor in (*factors, 0.0, 0.0, 0.0, 0.0)[:5])
         self.loops.append({"tag": "joint", "joint1": follower, "joint2": leader, "polycoef": polynomial})
 
     def followed(self, angles: Mapping[str, float]) -> dict[str, float]:
-        """Return joint angles [rad], those of coupled hinges as their leaders' angles demand."""
+        """Return `angles` [rad] with the angles of coupled hinges computed from those of their leaders."""
         found = dict(angles)
         for loop in self.loops:
             if loop["tag"] == "joint" and "joint2" in loop:
@@ -184,8 +184,8 @@ class Tree:
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. The hinges of the link before
-    that one stay where they are, and their axes and anchors are expressed in the turned frame.
+    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. Earlier hinges
+    of the link stay where they are; their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
     shift, back = hinge.anchor - rotate(turn, hinge.anchor), inverse(turn)
@@ -253,7 +253,7 @@ def inverse(quat: Vector) -> Vector:
 
 
 def add_mass(link: Link, mass: float, com: Vector, inertia: Vector) -> None:
-    """Add a body of `mass` [kg], centre `com` (3,) [m] and `inertia` (3, 3) about it, all in the frame of `link`, to it."""
+    """Add to `link` a `mass` [kg] with the centre `com` (3,) [m] and the `inertia` (3, 3) about this centre, link frame."""
     total = link.mass + mass
     if total <= 0.0:
         return
@@ -265,5 +265,5 @@ def add_mass(link: Link, mass: float, com: Vector, inertia: Vector) -> None:
 
 
 def _point(mass: float, at: Vector) -> Vector:
-    """Return the inertia (3, 3) of a point at `at` (3,) about the origin."""
+    """Return the inertia (3, 3) about the origin of a point mass at `at` (3,)."""
     return mass * (at @ at * np.eye(3) - np.outer(at, at))

@@ -1,5 +1,5 @@
-"""Reader of URDF files into a Tree. MuJoCo's own reader welds the base to the world, which loses its mass, and does not know
-packages.
+"""Reader of URDF files into a Tree. MuJoCo's own reader is not used, because it welds the base to the world and so loses the
+base's mass, and because it does not know packages.
 """
 
 import math
@@ -28,10 +28,10 @@ KINDS = (*HINGES, *NO_HINGES, "fixed")
 
 def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
     """Return the robot of a URDF file, with its visual shapes if `drawn`. Packages are also searched in `roots`. A link on a
-    fixed joint is a link without hinges.
+    fixed joint becomes a link without hinges.
 
     Raises:
-        ConfigError: the file is not a URDF, or not that of one robot.
+        ConfigError: the file is not a URDF, or does not describe exactly one robot.
     """
     root = _parsed(path)
     tree = Tree(root.get("name") or path.stem, path, [], 0.0)
@@ -63,7 +63,7 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
         waiting[:0] = [(other.child, here, other) for other in joints if other.parent == name]
     if len(tree.links) < len(elements):
         missing = sorted(set(elements) - {link.name for link in tree.links})
-        raise ConfigError(f"{path}: joints form a circle; not reached from '{top}': {', '.join(missing)[:200]}")
+        raise ConfigError(f"{path}: joints form a closed loop; links not connected to '{top}': {', '.join(missing)[:200]}")
     tree.mass = sum(link.mass for link in tree.links)
     leaders = {joint.name for joint in joints}
     for loop in (loop for loop in tree.loops if loop["joint2"] not in leaders):
@@ -99,8 +99,8 @@ def _parsed(path: Path) -> ET.Element:
 def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) -> tuple[str, list["_Joint"]]:
     """Return the base link, and the joints above it.
 
-    The base is the link that is no joint's child. Empty links there that carry a single link on a fixed or floating joint,
-    such as `world` and `base_footprint`, are removed with their joints.
+    The base is the link that is no joint's child. If it is empty and carries a single link on a fixed or floating joint, like
+    `world` or `base_footprint`, it is removed with the joint, and the link that it carries is the base.
     """
     children = [joint.child for joint in joints]
     twice = next((name for name in children if children.count(name) > 1), None)
@@ -123,7 +123,7 @@ def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) ->
 
 
 def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
-    """Keep the robot's orientation in the frame of the links above its base, and report that these links are left out."""
+    """Turn the robot as the joints above its base turn it, and report that the links above the base are left out."""
     for joint in reversed(above):
         tree.turn(_origin(joint.element, joint.path)[1])
         if joint.kind == "fixed" and joint.parent != "world":
@@ -135,7 +135,7 @@ def _check_degrees(tree: Tree) -> None:
     """Check that limits are in radians.
 
     Raises:
-        ConfigError: a joint can't reach any angle within a turn of 0, or half of the joints turn more than twice.
+        ConfigError: a joint's range is more than a turn away from 0, or most joints can turn farther than two turns.
     """
     limited = [hinge for hinge in tree.hinges if hinge.range is not None]
     far = [h for h in limited if h.range and (min(h.range) > 2.0 * math.pi or max(h.range) < -2.0 * math.pi)]
@@ -152,7 +152,7 @@ def _check_degrees(tree: Tree) -> None:
 
 
 def _say_what_is_unknown(tree: Tree, root: ET.Element) -> None:
-    """Report the elements that are left out, of the robot and of its joints."""
+    """Report the elements of the robot and of its joints that are left out."""
     left_out = [element.tag for element in root if element.tag not in ("link", "joint", "material")]
     left_out += [part.tag for joint in root.findall("joint") for part in joint if part.tag not in PARTS]
     for tag in dict.fromkeys(tag for tag in left_out if isinstance(tag, str)):
@@ -191,11 +191,11 @@ class _Joint:
         if self.kind == "fixed":
             return
         if self.kind in NO_HINGES:
-            tree.say(f"joints that {NO_HINGES[self.kind]} are no hinges, and held where they are at 0", self.name)
+            tree.say(f"joints that {NO_HINGES[self.kind]} are no hinges; they are held at position 0", self.name)
             return
         axes = self.element.findall("axis")
         if len(axes) > 1:
-            tree.say("joints with several axes, of which the first is taken", self.name)
+            tree.say("joints with several axes; only the first is used", self.name)
         axis = _numbers(axes[0], "xyz", 3, self.path) if axes else np.array([1.0, 0.0, 0.0])
         if not np.linalg.norm(axis) > 1e-9:
             raise ConfigError(f"{self.path}: joint '{self.name}': axis: must have a length, got 0 0 0")
@@ -222,7 +222,7 @@ class _Joint:
             if low < high and not (low < -MOST_TURNS and high > MOST_TURNS):
                 hinge.range = (max(low, -MOST_TURNS), min(high, MOST_TURNS))
             else:
-                tree.say("joints whose limits are no range, and which have none here", self.name)
+                tree.say("joints whose limits are not a valid range become joints without limits", self.name)
         dynamics = self.element.find("dynamics")
         if dynamics is not None:
             given = {"damping": "damping", "frictionloss": "friction"}
@@ -285,7 +285,7 @@ class _Shapes:
             if kind != "sphere":
                 size[1] = _number(given, "length", self.path) / 2.0
         else:
-            self.tree.say(f"a {kind} is not a shape of URDF and is left out, of link", link)
+            self.tree.say(f"a {kind} is not a shape of URDF and is left out, on link", link)
             return []
         if not (size[: 1 if kind == "sphere" else 3 if kind == "box" else 2] > 0.0).all():
             self.tree.say("shapes without a size are left out, of links", link)
@@ -304,7 +304,7 @@ class _Shapes:
         try:
             parts = meshes.read(self._file(name), scale)
         except MeshMissing:
-            self.tree.say(f"{kind} meshes that are not to be found in the folders around the file are left out", name)
+            self.tree.say(f"{kind} meshes that are not found in the folders around the file are left out", name)
             return []
         except (MeshProblem, OSError) as problem:
             self.tree.say(f"{kind} meshes are left out", str(problem))
@@ -315,7 +315,7 @@ class _Shapes:
         ]
 
     def _file(self, name: str) -> Path:
-        """Return the mesh file that the URDF calls `name`, else the only file of that name nearby."""
+        """Return the mesh file that the URDF names, else the only file nearby with the same file name."""
         folder = self.path.parent.resolve()
         try:
             return meshes.find(name, folder, self.roots)
@@ -345,7 +345,7 @@ def _colour(material: ET.Element) -> Vector | None:
 
 
 def _numbers(element: ET.Element, key: str, count: int, path: Path) -> Vector:
-    """Return the `count` numbers of an attribute."""
+    """Return the `count` numbers of an attribute. One number is enough for a `scale`."""
     text = element.get(key, "")
     try:
         values = np.array([float(x) for x in re.split(r"[\s,]+", text.strip()) if x])
@@ -359,7 +359,7 @@ def _numbers(element: ET.Element, key: str, count: int, path: Path) -> Vector:
 
 
 def _number(element: ET.Element, key: str, path: Path, default: float | None = None) -> float:
-    """Return the number of an attribute, or `default` if it is missing; limits may be infinite."""
+    """Return the number of an attribute, which may be infinite, or `default` if the attribute is missing."""
     text = element.get(key)
     if text is None and default is not None:
         return default

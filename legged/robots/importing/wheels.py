@@ -1,4 +1,4 @@
-"""Wheels: links at the end of a hinge without limits whose shapes are round about it. Their meshes become cylinders."""
+"""Wheels: end links on hinges without limits, with shapes that are round about the hinge's axis. Meshes become cylinders."""
 
 import re
 from dataclasses import replace
@@ -9,19 +9,19 @@ import numpy as np
 from legged.robots.importing.tree import Hinge, Shape, Tree, Vector, matrix
 
 ROUND = 1.09
-"""Largest width of a round outline as a multiple of its smallest; an octagon has 1.082."""
+"""An outline is round if its greatest width is at most this multiple of its least width. An octagon has 1.082."""
 DIRECTIONS = 32
 """Number of directions in which the width of an outline is measured."""
 OFF_CENTRE = 0.05
 """Largest distance of a wheel's centre from its hinge's axis, as a share of the wheel's radius."""
 TURNS = 4
-"""A hinge that can turn so often has no limits that matter."""
+"""A hinge with a range of at least this number of full turns counts as one without limits."""
 WHEEL = re.compile("wheel|tyre|tire", re.IGNORECASE)
-"""Pattern in the names of balls that are wheels."""
+"""Pattern in the names of wheels. Balls, and cylinders across their hinge's axis, are wheels only with such a name."""
 
 
 def find_wheels(tree: Tree) -> None:
-    """Mark the hinges of wheels, and replace round meshes on them by cylinders, in place. Welded links are merged already."""
+    """Mark the hinges of wheels, and replace round meshes of wheels by cylinders. Welded links have to be merged before."""
     for i, link in enumerate(tree.links):
         if len(link.hinges) != 1 or tree.children(i):
             continue
@@ -36,20 +36,20 @@ def find_wheels(tree: Tree) -> None:
         hinge.rolls, hinge.range = True, None
         for shape, turned in zip(link.shapes, rounds, strict=True):
             if turned is not None and turned.kind != shape.kind:
-                tree.say("round shapes on a hinge along their axis become cylinders", shape.link)
+                tree.say("round meshes of wheels become cylinders", shape.link)
             elif turned is not None and turned is not shape:
-                tree.say("guess: cylinders of wheels that stand across their hinge's axis are turned along it", shape.link)
+                tree.say("guess: wheels whose cylinders lie across the hinge's axis are turned along it", shape.link)
         link.shapes = [turned or shape for shape, turned in zip(link.shapes, rounds, strict=True)]
 
 
 def _across(point: Vector, hinge: Hinge) -> Vector:
-    """Return the vector (..., 3) from the axis of a hinge to points (..., 3)."""
+    """Return the shortest vectors (..., 3) from the axis of a hinge to points (..., 3)."""
     away = point - hinge.anchor
     return away - np.multiply.outer(away @ hinge.axis, hinge.axis)
 
 
 def _about(shape: Shape, hinge: Hinge) -> Shape | None:
-    """Return a shape as one that rolls about the axis of a hinge; None if it is not round about it."""
+    """Return the round shape about a hinge's axis that stands for `shape`; None if `shape` is not round about this axis."""
     if shape.points is not None:
         return _cylinder(shape, shape.points, hinge)
     if shape.kind not in ("sphere", "cylinder", "capsule"):
@@ -60,7 +60,7 @@ def _about(shape: Shape, hinge: Hinge) -> Shape | None:
     if shape.kind != "sphere" and along > 0.999:
         return shape
     called = bool(WHEEL.search(f"{shape.link} {shape.name} {hinge.name}"))
-    if shape.kind == "cylinder" and along < 0.001 and called:  # a file whose author forgot that cylinders stand along z
+    if shape.kind == "cylinder" and along < 0.001 and called:  # the author may have forgotten that cylinders lie along z
         return replace(shape, quat=_along(hinge))
     return shape if shape.kind == "sphere" and called else None
 
@@ -73,7 +73,7 @@ def _along(hinge: Hinge) -> Vector:
 
 
 def _cylinder(shape: Shape, points: Vector, hinge: Hinge) -> Shape | None:
-    """Return the cylinder about the axis of a hinge around points (V, 3); None if their outline is not round about it."""
+    """Return the cylinder about a hinge's axis that encloses points (V, 3); None if their outline is not round."""
     quat = _along(hinge)
     x, y, _ = matrix(quat).T
     angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
