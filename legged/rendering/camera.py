@@ -31,11 +31,11 @@ INK = (40, 40, 40)
 ON_A_PLANE = 130.0, -18.0
 """Azimuth and elevation of the camera on a plane [degrees]."""
 GLIDE, SMOOTH = 0.1, np.array([0.12, 0.12, 0.05])
-"""Share of its distance to the robot by which the camera moves per picture: GLIDE on a plane; SMOOTH, for x, y and z, on
-terrain. Small shares keep the robot's steps from shaking the picture.
+"""For each picture, the point that the camera looks at moves towards the robot by this share of the distance: GLIDE on a
+plane, SMOOTH (x, y, z) on terrain. Small shares keep the robot's steps from shaking the picture.
 """
 CUT = 1.5
-"""A robot on terrain that is farther than this from the middle of the picture was reset, and the camera jumps to it [m]."""
+"""If a robot on terrain is farther than this from the point that the camera looks at, the camera jumps to the robot [m]."""
 FLATTEST, STEEPEST = -22.0, -70.0
 """Limits of the camera's elevation on terrain [degrees]."""
 BEHIND, FRONT = 62.0, 118.0
@@ -58,7 +58,7 @@ ABOVE, APART = 0.335, 0.086
 ARROW, SLOWEST_SHOWN = 0.6, 0.03
 """Length of a velocity arrow for 1 m/s [m], and smallest velocity that is drawn as an arrow [m/s]."""
 SPOT, LIFTED = 0.086, 0.38
-"""Radius of the spot below a foot, in lengths of a robot: SPOT * (1 - height / LIFTED), but at least 30 % of SPOT."""
+"""Radius of the spot below a foot: SPOT * (1 - foot height / LIFTED), at least 0.3 SPOT; all in lengths of a robot."""
 ROOT, AWAY = 1, 2.4
 """A ModelCamera follows the body ROOT, the first one after the world, at a distance of AWAY lengths of the model."""
 DRAWN = 1000.0
@@ -95,7 +95,7 @@ class Camera:
         return self.renderer.render()
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels (N, 2), right and down from the upper left corner, of world points (N, 3) [m] after `update`."""
+        """Return the pixel coordinates (N, 2) of world points (N, 3) [m], from the upper left corner. Call `update` first."""
         eyes = self.renderer.scene.camera
         eye, forward, up = (np.mean([getattr(side, name) for side in eyes], axis=0) for name in ("pos", "forward", "up"))
         edge = eyes[0].frustum_top / eyes[0].frustum_near
@@ -104,7 +104,7 @@ class Camera:
         return 0.5 * np.array([self.width, self.height]) + 0.5 * self.height / edge * across / depth[:, None]
 
     def add_shape(self, kind: mujoco.mjtGeom, color: Sequence[float], size: Any, pos: Any) -> mujoco.MjvGeom:
-        """Add a shape with a MuJoCo `size` (3,) at `pos` (3,), world frame [m], to the next picture only; return it."""
+        """Add a shape of MuJoCo's `size` (3,) to the next picture only, at `pos` (3,), world frame [m]. Return the shape."""
         scene = self.renderer.scene
         geom, rgba = scene.geoms[scene.ngeom], np.array(color, dtype=np.float32)
         mujoco.mjv_initGeom(geom, kind, np.array(size, dtype=float), np.array(pos, dtype=float), np.eye(3).ravel(), rgba)
@@ -154,7 +154,7 @@ def window_opens() -> bool:
         warnings.simplefilter("ignore")
         opens = bool(glfw.init())
     if opens:
-        glfw.terminate()  # the viewer initialises GLFW in its own thread
+        glfw.terminate()  # because the viewer initialises GLFW itself, in another thread
     return opens
 
 
@@ -169,7 +169,7 @@ def size_of(robot: Robot) -> np.ndarray:
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Return the sides (3,) [m] of the axis-aligned box around all bodies of a model but the world, at `qpos` (nq,)."""
+    """Return the sides (3,) [m] of the axis-aligned box around all shapes, except the world's, of a model at `qpos` (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -408,8 +408,8 @@ def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 54
 
 
 def caption(picture: np.ndarray, lines: Sequence[str], colors: Sequence[Sequence[float]] = ()) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner. Line i has the colour number i
-    of `colors` (red, green, blue, 0 to 1), made darker; lines without such a colour are dark grey.
+    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner. Line i has a darker version of
+    the colour `colors[i]` (red, green, blue, 0 to 1). Further lines are dark grey.
     """
     if not lines:
         return picture

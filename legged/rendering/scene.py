@@ -21,7 +21,7 @@ FAR = 100.0
 CHECKER = 0.94, 1.0
 """Brightness of the dark and of the light squares of checkered ground."""
 SQUARE = 0.5
-"""Side of such a square [m]."""
+"""Side of a square of checkered ground [m]."""
 GROUND = "terrain_checker"
 LEVEL_RANGE = 0.9
 """Colours change between minus and plus this height [m]. On checkered terrain the range includes all heights."""
@@ -111,7 +111,7 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
 
 def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
     """Give a box one colour, or a height field a texture, by its height. Colours change from -`span` to `span` [m]. Points of
-    a height field below `lowest` [m] count as hidden. If `cell`, the side of a terrain cell [m], is given, draw squares.
+    a height field below `lowest` [m] count as hidden. With `cell`, the side of a terrain cell [m], the ground is checkered.
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]
@@ -133,9 +133,9 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: floa
 
 
 def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
-    """Return heights (X, Y) in which each `sunk`, hidden point has the mean height of its visible neighbours, or of all
-    visible points if it has no visible neighbour. Textures are blurred, so colours of hidden points show at the edge of
-    visible ones.
+    """Return heights (X, Y) in which each hidden point (`sunk`) has the mean height of its visible neighbours, or of all
+    visible points if it has no visible neighbour. This is needed because textures are blurred: colours of hidden points
+    affect the edges of visible ground.
     """
     if not sunk.any():
         return heights

@@ -131,7 +131,7 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     # On the map, x points upward and y to the left. The light comes from the upper left.
     heights = ground.heights[shown][::-1, ::-1]
     largest = max(float(np.abs(heights).max()), 0.05)
-    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps show next to high ones.
+    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps are visible next to high ones.
     scale, colors = AsinhNorm(linear_width=0.25, vmin=-largest, vmax=largest), colormaps["RdYlBu_r"]
     light = LightSource(azdeg=315, altdeg=45)
     shaded = light.shade(heights, colors, blend_mode="soft", norm=scale, vert_exag=2.0, dx=ground.cell, dy=ground.cell)
