@@ -20,7 +20,7 @@ HELD_OUT = 5
 FEWEST_HELD_OUT = 0.1
 """Whole runs are held out only if these runs together have at least this share of all samples."""
 UNEVEN = 0.01
-"""Largest deviation of the time between samples, as a share of the mean time step."""
+"""Largest allowed deviation from the time step, as a share of it."""
 SHORTEST = 200
 """Smallest number of samples of a joint."""
 
@@ -117,8 +117,9 @@ def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
 
 
 def read_log(path: Path) -> ActuatorLog:
-    """Read an .npz file with `joint_names` (D,), `target`, `position`, `velocity` and `torque` (all (T, D)), and `dt` [s] or
-    `time` (T,) [s]. Optional are `run` (T,), and `stiffness`, `damping` and `torque_limit` of the drives, numbers or (D,).
+    """Read an .npz file. It must hold `joint_names` (D,) and `target`, `position`, `velocity` and `torque` (T, D), and either
+    `dt` [s] or `time` (T,) [s]. It may hold `run` (T,), and the drives' `stiffness`, `damping` and `torque_limit`, each (D,)
+    or one number for all joints.
 
     Raises:
         ConfigError: an array is missing, unknown, of a wrong shape or not finite, or the samples are not evenly spaced.
@@ -176,7 +177,7 @@ def read_log(path: Path) -> ActuatorLog:
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
-    """Check that a log's torques vary, and that gains and torque limits of its joints are equal, so that one drive fits all.
+    """Check that one drive can be fitted to a log: its torques vary, and its joints have the same gains and torque limits.
 
     Raises:
         ConfigError: the torques are constant, or the joints differ in a gain or in the torque limit.

@@ -16,9 +16,9 @@ SEEN = 0.002
 PEAK, LIMITS = ("breakaway", "stribeck_velocity"), ("stall_torque", "no_load_speed")
 """Parameters that a fit may leave out: those of a friction peak, and those of the motor's torque-speed line."""
 MOST_SAMPLES = 40_000
-"""About the largest number of samples, spread evenly over the log, that a search uses."""
+"""A search uses about this many samples at most. They are spread evenly over the log."""
 ROUGHLY = 4_000
-"""The same number for the first searches, which try all delays."""
+"""The same limit for the first searches, which try all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
 WORTH = 0.005

@@ -14,7 +14,7 @@ LEARNING_RATE = {"mlp": 3e-3, "lstm": 1e-2}
 BATCH = 4096
 """Batch size of an MLP."""
 CHUNK, BURN_IN, CHUNKS = 60, 15, 64
-"""For an LSTM: samples in a sequence, samples at the start of a sequence without a loss, and sequences in an update."""
+"""For an LSTM: samples in a sequence, samples at its start that the loss leaves out, and sequences in an update."""
 
 
 def train_network(
