@@ -151,7 +151,7 @@ class TrainingEvaluation:
         return dict(zip(found, numbers, strict=True))
 
     def _found(self, measured: int) -> dict[str, Tensor]:
-        """Return name of a figure -> value (), from the sums of each robot. Errors were summed over `measured` steps."""
+        """Return name of a figure -> 0-dimensional value, from each robot's sums. Errors are sums over `measured` steps."""
         own = {name.removeprefix("Metrics/"): value for name, value in self.task.metrics.flush().items()}
         found = {
             "return": self._return.mean() / unit_of(self.task),

@@ -26,7 +26,7 @@ MOST_EPISODES = 2**16
 GYMNASIUM = "gymnasium"
 """Name of Gymnasium in files and tables, in place of the name of an engine."""
 REWARD = "reward_"
-"""Prefix of the names of the parts of the reward in the `info` of Gymnasium's steps."""
+"""Prefix that marks parts of the reward in the `info` of a step in Gymnasium."""
 
 
 def evaluate_episodes(setting: Setting, episodes: int) -> int:
@@ -82,7 +82,7 @@ def _report(result: dict[str, Any], folder: Path) -> None:
 @torch.inference_mode()
 def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
     """Run policy.pt from the folder `exported` in Gymnasium's environment `name`. Return the same figures as
-    `measure_episodes`, but with Gymnasium's rewards: its `terms` are the parts of the reward in the `info` of each step.
+    `measure_episodes`, but with Gymnasium's rewards; `terms` are the parts of the reward in the `info` of each step.
 
     Raises:
         ConfigError: Gymnasium has no environment `name`, or its observations or actions do not fit the policy.

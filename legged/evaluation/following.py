@@ -80,7 +80,7 @@ def evaluate_following(
     return 0
 
 
-# ---- in every engine -------------------------------------------------------------------------------------------------
+# ---- all engines -----------------------------------------------------------------------------------------------------
 
 
 def cross(setting: Setting, grid: Grid) -> int:
@@ -171,7 +171,7 @@ def draw_crossing(result: dict[str, Any], path: Path) -> None:
         drawn.suptitle(f"{result['task']} in every engine")
 
 
-# ---- of every checkpoint ---------------------------------------------------------------------------------------------
+# ---- all checkpoints -------------------------------------------------------------------------------------------------
 
 
 def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING_RMSE, falls: float = WALKING_FALLS) -> int:

@@ -21,7 +21,7 @@ def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
     share, scale = successes / trials, 1.0 + z**2 / trials
     middle = (share + 0.5 * z**2 / trials) / scale
     half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # it must contain the share
+    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # the interval contains the share
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
@@ -38,7 +38,7 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
 def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
     """Return the equally weighted mean of `shares`, each (successes, trials), and the interval of the mean. The interval adds
     the squared distances from each share to the ends of its Wilson interval (G. Y. Zou and A. Donner, Statistics in Medicine
-    27, 2008). So its width is above 0 even if all shares are 0 or 100 %.
+    27, 2008). So the interval has a width above 0 even if all shares are 0 or 100 %.
     """
     found = [(n / of, *wilson(n, of)) for n, of in shares]
     mean = sum(share for share, _, _ in found) / len(found)
@@ -59,7 +59,7 @@ def normal_mean(mean: float, std: float, count: int) -> Interval | None:
 def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval | None:
     """Return the interval of the difference `second` - `first` of two means, each (mean, sample standard deviation, count).
     The standard deviations may differ (B. L. Welch 1947). Counts are assumed to be large, so the normal distribution replaces
-    Student's t. Return None if one of the means is that of fewer than two values.
+    Student's t. Return None if a count is below 2.
     """
     if min(first[2], second[2]) < FEWEST:
         return None

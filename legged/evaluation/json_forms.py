@@ -8,7 +8,7 @@ from legged.errors import ConfigError
 TEXT, NUMBER, POSITIVE, INDEX = "a text", "a number", "a number above 0", "a whole number of at least 0"
 """Forms of single values. A number is below LARGEST in magnitude; a number above 0 is above SMALLEST."""
 ANY = "*"
-"""Stands for all names of a mapping in the description of its form."""
+"""Key in the form of a mapping that stands for all names in the mapping."""
 LARGEST, SMALLEST = 1e30, 1e-9
 ABSENT = object()
 """Stands for the value of a name that a mapping lacks."""
@@ -16,7 +16,7 @@ ABSENT = object()
 
 @dataclass(frozen=True)
 class OrNull:
-    """The form of a value that has the form `form` or is null."""
+    """Form of a value that may be null and otherwise has the form `form`."""
 
     form: Any
 
@@ -26,7 +26,7 @@ def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str
 
     `form` is one of the constants above, a set of allowed values, or an `OrNull`. A list of values is described by [form], by
     [form, ...] if it may not be empty, or by a tuple with a form for each entry. A mapping is described by a mapping from
-    names to forms; a name that ends in ? may be absent. A message names the wanted form, followed by the text `or_null`.
+    names to forms; a name that ends in ? may be absent. Messages add the text `or_null` to the name of the form.
 
     Raises:
         ConfigError: the value has another form. The message begins with `damaged`, which names the file and its damage.

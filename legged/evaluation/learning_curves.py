@@ -18,7 +18,7 @@ from legged.learning.run_folder import CONFIG_FILE
 SAME_TIME = 0.05
 """Runs share a time axis if their mean times of an iteration differ by at most this share."""
 MOST_PARTS = len(COLORS) - 1
-"""Largest number of parts of the reward that have their own colour. The sum of all smaller parts has another one."""
+"""Largest number of parts of the reward that have their own colour. Smaller parts are summed."""
 EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
 """Prefixes of tags; `WATCHED` is the prefix of evaluations during training."""
 SINGLE = ("Metrics/lin_vel_rmse", "Metrics/ang_vel_rmse", "Metrics/falls")

@@ -67,14 +67,14 @@ class Stage:
                     data.ctrl[:] = np.clip(torques, -limits, limits)
                 mujoco.mj_step(model, data)
             state = lin_vel, ang_vel, gravity = _base(data)
-            fallen = not np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN  # NaN is a fall
+            fallen = not np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN  # NaN counts as a fall
             yield Moment(float(data.time), np.array([*lin_vel[:2], ang_vel[2]]), float(data.qpos[2]), fallen)
 
 
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[dict[str, Any]]:
-    """Play every command for `seconds` with the friction `friction`, from the default pose with the feet on the ground.
+    """Play every command for `seconds`, from the default pose on the ground. `friction` is that of robot and ground.
 
     Return a mapping for each command. `velocity` is the mean after SETTLING_S in the base frame [m/s, m/s, rad/s] and
     `lowest_base` the smallest height of the base after SETTLING_S [m]; both are None if the robot fell. `fell_after` is the
@@ -119,7 +119,7 @@ def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> 
 
 
 def _base(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return linear velocity [m/s], angular velocity [rad/s] and gravity's direction (unit vector), (3,), base frame."""
+    """Return linear velocity [m/s], angular velocity [rad/s] and unit vector along gravity, each (3,), in the base frame."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, data.qpos[3:7])
     to_world = turn.reshape(3, 3)

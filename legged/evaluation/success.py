@@ -43,7 +43,7 @@ TILE = 8.0
 DISTANCE = 4.0
 """Distance from the start at which a robot succeeds [m]: half a tile."""
 TIME_S = 20.0
-"""Time limit for this distance [s]."""
+"""Time limit for DISTANCE [s]."""
 FORWARD, SIDEWAYS = 0.75, 0.1
 """Commanded forward velocity, and the largest commanded velocity to either side [m/s]."""
 SPAWN_RANGE = 0.1
@@ -97,7 +97,7 @@ class Scores:
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
-        """Take the starting points `start` (N, 2 or more), world frame [m], and the `distance` that is a success [m]."""
+        """Robots start at `start` (N, 2 or more), world frame [m], and succeed at `distance` [m] from their own start."""
         self._start, self._distance = start[:, :2].clone(), distance
         self._open = torch.ones(len(start), dtype=torch.bool, device=start.device)
         self.outcome = torch.full((len(start),), STUCK, device=start.device)
@@ -119,7 +119,7 @@ class Scores:
 
     @property
     def done(self) -> bool:
-        """True if every robot has had its event."""
+        """True if every robot has had its first event."""
         return not bool(self._open.any())
 
 
@@ -127,7 +127,7 @@ class Scores:
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of the terrain type `name`, ascending, in the type's unit. `scale` is `terrain.scale`."""
+    """Return the sizes of a terrain type, ascending, in its unit; `full` as in `--full`. `scale` is `terrain.scale`."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
     # A type without a list is measured at the sizes of these difficulties; 1.2 is harder than training, which ends at 1.
@@ -137,7 +137,7 @@ def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
 
 def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float) -> dict[str, tuple[float, ...]]:
     """Return terrain type -> sizes in its unit, in ascending order. The types are those in the comma-separated list `asked`.
-    Without a list they are those of the training, of which a plane has none.
+    Without a list they are those of the training; a training on a plane has no terrain types.
 
     Sizes may follow a type in the list: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Without them, `sizes_of` gives the sizes.
 
@@ -149,7 +149,7 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
     entries = [[part.strip() for part in entry.partition("=")] for entry in asked.split(",")]
     terrain_types("--types", ",".join(name for name, _, _ in entries))
     if cfg.terrain.mesh_type == "plane" and "heights" in cfg.observations.groups["actor"].terms:
-        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane, so its policy cannot use 'heights'")
+        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane, so its policy has not learned to use 'heights'")
     return {name: _named_sizes(name, text) if given else sizes_of(name, full, scale) for name, given, text in entries}
 
 
@@ -235,7 +235,7 @@ def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
 
 
 def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
-    """Return the share of robots that were `successful` (flags, (n,)), with its interval, and the number `fell`."""
+    """Return the share of successful robots, with interval and counts, from flags `successful` (n,) and the count `fell`."""
     trials, successes = len(successful), int(successful.sum())
     low, high = wilson(successes, trials)
     share = successes / trials

@@ -56,7 +56,7 @@ def cell_for(name: str, cfg: TerrainConfig) -> float:
 
 
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build one level tile with bumps, on which all robots of a grid walk. `cfg` has its size (see `rough_side`)."""
+    """Build one level tile with bumps, on which all robots of a grid walk. `cfg` holds the tile's size (see `rough_side`)."""
     return Terrain.of_tiles([[TileSpec("rough_slope_up", 0.0)]], cfg, np.random.default_rng(seed))
 
 

@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0
 """Margins around the axes [SVG units]."""
 MOST_POINTS = 240
-"""Largest number of points of a line. Neighbouring points of longer lines are averaged; a drawing has hardly more pixels."""
+"""Largest number of points of a line. Points of longer lines are averaged, because a drawing has hardly more pixels."""
 LETTER = 6.3
 """Mean width of a letter of the legend [SVG units]."""
 INK, QUIET, GRID, REST = "#1b1f24", "#57606a", "#e1e5e9", "#9aa4ae"

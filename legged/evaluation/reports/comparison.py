@@ -1,5 +1,5 @@
 """Comparisons of evaluations, in tables for the screen, and of runs, on a page with settings, curves and evaluations. In the
-tables, evaluations of one task in one engine under the same conditions form a group; they count as different seeds.
+tables, evaluations of one task in one engine under the same conditions count as those of different seeds.
 """
 
 from collections.abc import Callable, Sequence

@@ -77,7 +77,7 @@ class Record:
     note: str
     """The user's note on the run (`--note`)."""
     status: str
-    """finished, running, interrupted, crashed or killed."""
+    """One of finished, running, interrupted, crashed and killed."""
     why: str
     """Details of the status."""
     done: int
@@ -130,7 +130,7 @@ class Record:
 
 
 def folders_in(path: Path) -> list[Path]:
-    """Return the run folders among a folder, the folders in it, and the folders in these, so that it may be logs/.
+    """Return the run folders at or below `path`, at most two levels deep: `path` may be a run folder, logs/<task>/ or logs/.
 
     Raises:
         ConfigError: there is no run folder.
@@ -202,7 +202,7 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
 
 def is_running(folder: Path) -> bool:
     """Return whether the process that writes a run's log is alive. On this machine it is looked up by its id, which is in the
-    log's name (events.out.tfevents.<time>.<host>.<process>.<file>). On others it must have written recently.
+    log's name (events.out.tfevents.<time>.<host>.<process>.<file>). On another machine the log must have changed recently.
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)

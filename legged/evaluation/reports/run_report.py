@@ -263,7 +263,7 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
 
     If `film_with` is given, a second process films the policy and writes the report again with the film. `film_with` holds
     command-line options with which the second process finds the run's task. The film has its own process because a failing
-    graphics driver may end or block a process. Its output goes to LOG in the run folder, and this process does not wait.
+    graphics driver may end or block a process. The second process writes to LOG in the run folder; nothing waits for it.
     """
     start = time.perf_counter()
     try:

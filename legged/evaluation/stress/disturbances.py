@@ -19,7 +19,7 @@ from legged.robots.similarity import Size, grown
 from legged.terrain import Terrain
 
 WRITTEN_FOR = "anymal_c"
-"""The numbers below are for this robot. They are scaled for other robots."""
+"""Robot for which the numbers of the table are written. They are scaled for other robots."""
 
 PUSH_INTERVAL = 5.0
 """Time between two pushes of a robot [s]."""
@@ -42,11 +42,11 @@ class Disturbance:
     friction: float | None = _told("friction {:g}", default=None)
     """Sliding friction of all contacts of the robot; None keeps the nominal friction [1]."""
     motors: float = _told("motors at {:.0%}", default=1.0)
-    """Factor on the torque of every motor and on its limit [1]."""
+    """Factor on every motor's torque and torque limit [1]."""
     delay: float = _told("targets {:g} s late")
     """Delay of the targets on the way to the motors [s]."""
     push: float = _told(f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s", "m/s")
-    """Largest random velocity, either way, to which the base is set along the world's x and y every PUSH_INTERVAL [m/s]."""
+    """Every PUSH_INTERVAL the base gets a random velocity along the world's x and y, up to this, either way [m/s]."""
     zero_offset: float = _told("encoders up to {:g} rad off")
     """Largest random error of the encoders, either way [rad]. Policy and motors both use the wrong angles."""
     tilt: float = _told("inertial sensor askew by {:g} rad")
@@ -73,7 +73,7 @@ class Disturbance:
 GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
 """Properties in domain_rand.ranges that the disturbances set."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
-"""Disturbances of which the task's configuration gets the largest value over all robots."""
+"""Disturbances whose largest value over all robots is set in the task's configuration."""
 NOMINAL = Disturbance("nominal")
 ALONE = (
     Disturbance("payload", payload=8.0),
@@ -167,10 +167,10 @@ def make_stressed(
 
 
 class GivenMap(HeightMapErrors):
-    """Errors of a height map with given instead of random values, which are the same in every episode."""
+    """Errors of a height map. Their values are given instead of random, and are the same in every episode."""
 
     given: tuple[Tensor, Tensor]
-    """Values of `error` and `holes`."""
+    """Given values of `error` and `holes`."""
 
     def advance(self, begun: Tensor) -> None:
         for own, given in zip((self.error, self.holes), self.given, strict=True):

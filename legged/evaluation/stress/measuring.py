@@ -69,7 +69,7 @@ COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "gro
 LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
 COMBINED = ("together", "everything")
 SETTING_LINES = ("nominal", "together")
-"""Lines of the table that are measured with each solver setting. With `full` all lines are."""
+"""Lines of the table that are measured with each solver setting. With `full` all lines are measured."""
 
 
 def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
@@ -110,9 +110,9 @@ class Bench:
         payload: float | None = None,
         lines: Sequence[str] = (),
     ) -> None:
-        """Prepare a test with `robots` robots for each line of the table. `riser` (by default RISER times the scale) and
-        `tread` are the height and the width of the steps [m], `payload` (by default the table's) is the mass on the base
-        [kg], and `lines` (by default all) are the names of the lines to measure.
+        """Prepare a test with `robots` robots for each line of the table. The steps of the stairs have the height `riser` [m]
+        and the width `tread` [m], and `payload` is the mass on the base [kg]. `lines` are the names of the lines to measure.
+        By default the height is RISER times the scale, the payload is that of the table, and all lines are measured.
 
         Raises:
             ConfigError: the robot cannot be loaded, or an override randomises a property that the disturbances set.
@@ -258,7 +258,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
     others = {}
     tried = settings(bench.cfg, engine) if full or bench.whole else {}
     if tried and HALF_STEP not in tried:
-        print(f"{HALF_STEP}: left out, because the LSTM in control.actuator.network works with one step only", flush=True)
+        print(f"{HALF_STEP}: left out; the LSTM in control.actuator.network works with one time step only", flush=True)
     for name, changes in tried.items():
         print(f"{name}: {len(few)} lines", flush=True)
         others[name] = bench.measure(few, changes)
@@ -293,7 +293,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
 
 
 def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
-    """Return rows of kind (a key of COLORS), name, description, figures on stairs or new ground, and figures on the flat."""
+    """Return rows: kind (key of COLORS), name, description, figures on stairs or new ground, and figures on the flat."""
     named = [("combined" if line["name"] in COMBINED else "table", line["name"], line) for line in result["lines"]]
     for name, lines in result["settings"].items():
         named += [("settings", f"{name}: {line['name']}", line) for line in lines]
