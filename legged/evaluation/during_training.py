@@ -1,4 +1,4 @@
-"""Evaluations during training: a policy is measured between iterations, on undisturbed robots in a separate task."""
+"""Evaluations during training. Between iterations, the policy is measured on undisturbed robots in a separate task."""
 
 from dataclasses import replace
 from typing import Any
@@ -25,12 +25,12 @@ from legged.registry import make_task, task_class
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""
 SETTLE_S = 1.0
-"""Time at the start of a command in which errors are not measured [s]. It is at most a third of the hold."""
+"""Time from the start of a command to the start of the measurement, or a third of the command's time if that is less [s]."""
 
 
 def few_commands(cfg: LeggedConfig) -> Grid:
-    """Return the grid of commands for `train.runner.evaluate_envs` robots. If there are more commands than robots, values
-    between the ends of the axes are left out.
+    """Return the grid of commands for `train.runner.evaluate_envs` robots. If the configured grid has more commands than
+    robots, every second value of its longest axis is left out, repeatedly.
 
     Raises:
         ConfigError: an axis of the configuration is not a range.
@@ -46,20 +46,20 @@ def few_commands(cfg: LeggedConfig) -> Grid:
 
 
 def thinned(values: list[float]) -> list[float]:
-    """Return about half of the values, evenly spread, including the first and the last; of two values only the first."""
+    """Return about half of the values, evenly spread, with the first and the last one. Of two values, return the first."""
     keep = (len(values) + 1) // 2
     last = len(values) - 1
     return [values[round(i * last / (keep - 1))] for i in range(keep)] if keep > 1 else values[:1]
 
 
 class TrainingEvaluation:
-    """Measurement of a policy in a separate task, which is the training's without noise, pushes, randomisation and curricula.
-    Every measurement starts from the same random state and leaves the training's random generators unchanged.
+    """Measurement of a policy in a copy of the training's task without noise, pushes, randomisation and curricula. Every
+    measurement starts from the same random state and leaves the training's random generators unchanged.
     """
 
     def __init__(self, training: BaseTask) -> None:
-        """Build the task on the device and in the engine of the `training`. If the training's step is captured, as
-        a CUDA graph, the step of the evaluation is captured too.
+        """Build the task on the device and in the engine of the task `training`. If the training's step is a CUDA graph, the
+        evaluation's step is one too, unless the policy is recurrent.
 
         Raises:
             ConfigError: the grid of commands is invalid.
@@ -93,7 +93,7 @@ class TrainingEvaluation:
         self._sums = torch.zeros(4, task.num_envs, device=device)
         self._return, self._length, self._lin, self._ang = self._sums
         self._measured = torch.zeros((), device=device)
-        """() 1 while errors are measured, 0 while robots settle."""
+        """() 1 while errors are measured, 0 at the start of a command."""
         self._zero = torch.zeros((), device=device)
         if self._grid is not None:
             cells = torch.tensor(self._grid.cells, dtype=torch.float32, device=device)
@@ -101,7 +101,7 @@ class TrainingEvaluation:
             self._standing = torch.zeros(task.num_envs, 3, device=device)
 
     def _step(self) -> None:
-        """Make one control step, and add its rewards and errors to the sums."""
+        """Simulate one control step, and add its rewards and errors to the sums."""
         task = self.task
         task.step_in_place(self._actor(self._observations))
         self._return.add_(torch.where(self._running, task.rew_buf, self._zero))
@@ -116,13 +116,13 @@ class TrainingEvaluation:
             self._ang.add_(self._measured * yaw_rate_error(self._commands, ang_vel))
 
     def measure(self, policy: nn.Module) -> dict[str, float]:
-        """Return figure -> value over the first episode of each robot. `policy` is an rsl-rl model with the architecture of
-        the task's own; its weights are copied.
+        """Return name of a figure -> its value over the first episode of each robot. `policy` is an rsl-rl model with the
+        architecture of the policy in training; its weights are copied.
 
         `return` is the mean undiscounted sum of scale * term over steps, `falls` the share of robots that failed, and
         `episode_length` the mean number of steps in the episode. For robots that follow commands, `lin_vel_rmse` [m/s] and
-        `ang_vel_rmse` [rad/s] are the root mean square errors of each command, averaged over commands. They are those of
-        `legged evaluate`, except that a fallen robot counts as standing still. Other metrics are means over robots and steps.
+        `ang_vel_rmse` [rad/s] are the root mean square errors of each command, averaged over commands. A fallen robot counts
+        as standing still; `legged evaluate` leaves it out. Other metrics are means over robots and steps.
         """
         task, grid = self.task, self._grid
         device = torch.device(task.device)
@@ -151,7 +151,7 @@ class TrainingEvaluation:
         return dict(zip(found, numbers, strict=True))
 
     def _found(self, measured: int) -> dict[str, Tensor]:
-        """Return figure -> tensor (), computed from sums over the robots; errors were summed over `measured` steps."""
+        """Return name of a figure -> 0-dimensional value, from each robot's sums. Errors are sums over `measured` steps."""
         own = {name.removeprefix("Metrics/"): value for name, value in self.task.metrics.flush().items()}
         found = {
             "return": self._return.mean() / unit_of(self.task),
@@ -165,7 +165,7 @@ class TrainingEvaluation:
 
 
 def check_commands(cfg: TaskConfig) -> None:
-    """Check that a task's configuration gives a grid of commands for evaluations during training, if they are enabled.
+    """If evaluations during training are enabled, check that the configuration gives a grid of commands for them.
 
     Raises:
         ConfigError: an axis is not a range.

@@ -7,7 +7,7 @@ from legged.config.schema import NewtonSolver
 
 
 class Engine(NamedTuple):
-    """An engine, or one of Newton's solvers: the name in tables, and the overrides that choose the engine."""
+    """An engine, or Newton with one of its solvers: name in tables, and overrides that select this engine and solver."""
 
     label: str
     overrides: Sequence[tuple[str, Any]] = ()
@@ -25,11 +25,11 @@ ENGINES = {
 
 
 def engine_of(name: str) -> Engine:
-    """Return the engine called `name`; an unknown engine is labelled with that name."""
+    """Return the engine called `name`. An unknown engine gets its name as the label."""
     return ENGINES.get(name, Engine(name))
 
 
 def by_engine(results: Iterable[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return name of the engine -> its result, in the order of ENGINES; other engines come last."""
+    """Return name of an engine -> the result in it, in the order of ENGINES. Engines that are not in ENGINES come last."""
     found = {result["physics"]: result for result in results}
     return {name: found[name] for name in sorted(found, key=lambda name: [*ENGINES, name].index(name))}

@@ -1,4 +1,4 @@
-"""Evaluation of tasks without commands by full episodes, in an engine of this package or in Gymnasium's environment."""
+"""Evaluation of tasks without commands over full episodes, in an engine of this package or in Gymnasium's environment."""
 
 import io
 import json
@@ -24,14 +24,14 @@ from legged.registry import task_class
 MOST_EPISODES = 2**16
 """Largest number of episodes that are simulated at once."""
 GYMNASIUM = "gymnasium"
-"""Name that stands for Gymnasium where files and tables name an engine."""
+"""Name of Gymnasium in files and tables, in place of the name of an engine."""
 REWARD = "reward_"
-"""Prefix of the names of reward parts that Gymnasium returns with each step."""
+"""Prefix that marks parts of the reward in the `info` of a step in Gymnasium."""
 
 
 def evaluate_episodes(setting: Setting, episodes: int) -> int:
-    """Run `episodes` robots through their first full episode, without noise and randomisation; print a table and write
-    evaluation_<physics>.json. Return the exit code.
+    """Run `episodes` robots for one episode each, without noise and randomisation. Print a table, write
+    evaluation_<physics>.json, and return the exit code.
 
     Raises:
         RunError: the file can't be written.
@@ -47,13 +47,13 @@ def evaluate_episodes(setting: Setting, episodes: int) -> int:
 
 
 def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
-    """Export the policy into the folder of the result, run the exported TorchScript in Gymnasium's environment for `episodes`
-    episodes with the seeds 0, 1, ..., print a table and write evaluation_gymnasium.json. Return the exit code.
+    """Export the policy into the folder of the result. Run the exported TorchScript in Gymnasium's environment for `episodes`
+    episodes with the seeds 0, 1, ... Print a table, write evaluation_gymnasium.json, and return the exit code.
 
     Raises:
-        ConfigError: the task's class names no environment (`GYMNASIUM_ID`), Gymnasium has no environment of that name, or
-            the environment has other observations or actions than the policy.
-        RunError: Gymnasium fails, or a file can't be written.
+        ConfigError: the task's class has no GYMNASIUM_ID, Gymnasium has no environment of that name, or the environment has
+            other observations or actions than the policy.
+        RunError: the policy reads more than one observation, or a file can't be written.
     """
     start = time.perf_counter()
     setting = replace(setting, device=torch.device("cpu"))
@@ -72,7 +72,6 @@ def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
 
 
 def _report(result: dict[str, Any], folder: Path) -> None:
-    """Print the table of a result, then write its file."""
     title = f"{result['task']} ({result['checkpoint']}) in {result.get('environment', result['physics'])}"
     Console(width=110).print(episodes_table(result["episodes"], title))
     path = folder / file_name(result["physics"])
@@ -82,11 +81,12 @@ def _report(result: dict[str, Any], folder: Path) -> None:
 
 @torch.inference_mode()
 def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
-    """Run policy.pt of the folder `exported` in the environment `name` of Gymnasium. Return a mapping like that of
-    `measure_episodes`. Its returns are Gymnasium's, and its terms are the reward parts that Gymnasium names.
+    """Run policy.pt from the folder `exported` in Gymnasium's environment `name`. Return the same figures as
+    `measure_episodes`, but with Gymnasium's rewards; `terms` are the parts of the reward in the `info` of each step.
 
     Raises:
-        ConfigError: there is no such environment, or it has other observations or actions than the policy.
+        ConfigError: Gymnasium has no environment `name`, or its observations or actions do not fit the policy.
+        RunError: the policy reads more than one observation.
     """
     import gymnasium
 

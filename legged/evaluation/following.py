@@ -1,4 +1,6 @@
-"""Evaluations of legged robots that follow commands: on the grid and over difficulty, in all engines, of all checkpoints."""
+"""Evaluations of legged robots that follow commands: tracking and success on terrain, tracking in all engines, and tracking
+of all checkpoints of a run.
+"""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -35,9 +37,9 @@ WALKING_FALLS = 0.01
 def evaluate_following(
     setting: Setting, grid: Grid | None, sizes: Mapping[str, Sequence[float]] | None = None, robots: int = 0
 ) -> int:
-    """Measure tracking on the grid, if one is given, and success on terrain with `robots` robots for each of the
-    `sizes` of each terrain type. Print tables, write evaluation_<physics>.json and .png and success_<physics>.png, and return
-    the exit code. A part that is not measured now is kept from an older file of the same checkpoint.
+    """Measure tracking on the `grid`, if given, and success on terrain with `robots` robots for each of the `sizes` of each
+    terrain type, if given. Print tables, write evaluation_<physics>.json and .png and success_<physics>.png, and return the
+    exit code. If only one of the two is measured, the file keeps its older values of the other for the same checkpoint.
 
     Raises:
         RunError: a file can't be written.
@@ -52,7 +54,7 @@ def evaluate_following(
             tracking = {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **tracking}}
         del task, act  # a GPU may not have the memory for two tasks
     success = success_over_difficulty(setting, sizes, robots) if sizes else None
-    # Results are printed first, so that a full disk cannot lose them.
+    # Results are printed before files are written, so that they are not lost if the disk is full.
     shown = {**head, **tracking_of(tracking), "ground": "on rough ground, " if "rough" in tracking else ""}
     if tracking:
         print_tracking(shown)
@@ -78,12 +80,12 @@ def evaluate_following(
     return 0
 
 
-# ---- in every engine -------------------------------------------------------------------------------------------------
+# ---- all engines -----------------------------------------------------------------------------------------------------
 
 
 def cross(setting: Setting, grid: Grid) -> int:
-    """Measure the grid in every engine (the C engine runs on the CPU), write crossing.json after each of them, then print and
-    draw the results. Return the exit code.
+    """Measure tracking on the grid in every engine; the C engine runs on the CPU. Write crossing.json after each engine. At
+    the end print and draw the results, and return the exit code.
     """
     path, failure = setting.folder / "crossing.json", None
     result: dict[str, Any] = {
@@ -112,7 +114,7 @@ def cross(setting: Setting, grid: Grid) -> int:
 
 
 def _measured(setting: Setting, grid: Grid) -> dict[str, Any]:
-    """Return the figures of one engine. `steps_per_s` is measured without start-up and compilation."""
+    """Return the figures of one engine. The time for `steps_per_s` does not include start-up and compilation."""
     print(f"{setting.engine}: {grid.size_text}", flush=True)
     task, act = ready_to_track(setting, grid)
     start = time.perf_counter()
@@ -132,7 +134,7 @@ def _measured(setting: Setting, grid: Grid) -> dict[str, Any]:
 
 
 def crossing_table(result: dict[str, Any]) -> Table:
-    """Return a table with one line for each engine. An engine in which every robot fell early has no errors."""
+    """Return a table with one line for each engine. If every robot fell before it was measured, the errors are "none"."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
     forms = {"rmse_lin": "{:.3f} m/s", "rmse_ang": "{:.3f} rad/s", "falls": "{:.1f} %"}
@@ -146,7 +148,7 @@ def crossing_table(result: dict[str, Any]) -> Table:
 
 
 def draw_crossing(result: dict[str, Any], path: Path) -> None:
-    """Draw bars, one for each engine: errors, falls, speed."""
+    """Draw bar charts of errors, falls and simulation speed, with one bar for each engine."""
     rows = result["engines"]
     names = [row["physics"] for row in rows]
     panels = (
@@ -169,25 +171,26 @@ def draw_crossing(result: dict[str, Any], path: Path) -> None:
         drawn.suptitle(f"{result['task']} in every engine")
 
 
-# ---- of every checkpoint ---------------------------------------------------------------------------------------------
+# ---- all checkpoints -------------------------------------------------------------------------------------------------
 
 
 def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING_RMSE, falls: float = WALKING_FALLS) -> int:
     """Measure every checkpoint in the policy's folder on the grid, print a line for each, and name the first that walks. A
-    policy walks if its mean velocity RMSE is below `rmse` [m/s] and its share of falls below `falls`. Write
+    policy walks if its mean velocity RMSE is below `rmse` [m/s] and its share of falls is below `falls`. Write
     time_to_walk.json; return the exit code.
 
-    The times are wall time [s] since the start of the process that wrote the checkpoint, including imports.
+    The time of a checkpoint is the wall time [s] from the start of the training process, before its imports, until the
+    checkpoint was written.
 
     Raises:
-        ConfigError: a checkpoint does not hold its time. Then nothing is measured.
+        ConfigError: a checkpoint does not hold its time. In this case nothing is measured.
         RunError: the file can't be written.
     """
     there: dict[Path, float] = {}
     for path in checkpoints(setting.policy.folder).values():
         written_s = (read_checkpoint(path).get("infos") or {}).get("wall_s")
         if not isinstance(written_s, int | float):
-            raise ConfigError(f"{relative(path)}: holds no time at which it was written")
+            raise ConfigError(f"{relative(path)}: does not hold the time at which it was written")
         there[path] = float(written_s)
     task, act = ready_to_track(setting, grid)
     rows: list[dict[str, Any]] = []
@@ -225,5 +228,5 @@ def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING
 
 
 def walks(row: dict[str, Any], rmse: float, falls: float) -> bool:
-    """Return whether a checkpoint walks: both figures are below their limits. It has no error if all its robots fell."""
+    """Return whether a checkpoint's velocity RMSE and share of falls are below their limits; False if all its robots fell."""
     return row["rmse_lin"] is not None and row["rmse_lin"] < rmse and row["falls"] < falls

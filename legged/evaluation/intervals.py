@@ -11,22 +11,22 @@ DRAWS = 2000
 """Number of resamples of a bootstrap."""
 
 FEWEST = 2
-"""Least number of values for an interval, because the spread of a single value is not known."""
+"""Smallest number of values for which there is an interval. A single value has no spread."""
 
 Interval = tuple[float, float]
 
 
 def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
-    """Return Wilson's score interval of a share (E. B. Wilson 1927). It lies in [0, 1], with a width at 0 and 100 % too."""
+    """Return Wilson's score interval of a share (E. B. Wilson 1927). It lies in [0, 1], and its width is never 0."""
     share, scale = successes / trials, 1.0 + z**2 / trials
     middle = (share + 0.5 * z**2 / trials) / scale
     half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # it must contain the share
+    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # the interval contains the share
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
-    """Return the interval of the difference `second` - `first` of two shares, each (successes, trials), from the Wilson
-    intervals of both (R. G. Newcombe, Statistics in Medicine 17, 1998, method 10).
+    """Return the interval of the difference `second` - `first` of two shares, computed from their Wilson intervals (R. G.
+    Newcombe, Statistics in Medicine 17, 1998, method 10). Each share is given as (successes, trials).
     """
     (a, (a_low, a_high)), (b, (b_low, b_high)) = ((n / of, wilson(n, of)) for n, of in (first, second))
     return (
@@ -36,9 +36,9 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
 
 
 def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
-    """Return the mean of equally weighted shares, each (successes, trials), and its interval. Their Wilson intervals are
-    combined by adding squared distances to their ends (G. Y. Zou and A. Donner, Statistics in Medicine 27, 2008), so the
-    interval has a width even if all shares are 0 or 100 %.
+    """Return the equally weighted mean of `shares`, each (successes, trials), and the interval of the mean. The interval adds
+    the squared distances from each share to the ends of its Wilson interval (G. Y. Zou and A. Donner, Statistics in Medicine
+    27, 2008). So the interval has a width above 0 even if all shares are 0 or 100 %.
     """
     found = [(n / of, *wilson(n, of)) for n, of in shares]
     mean = sum(share for share, _, _ in found) / len(found)
@@ -47,7 +47,7 @@ def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
 
 
 def normal_mean(mean: float, std: float, count: int) -> Interval | None:
-    """Return the interval of a mean over `count` values with the sample standard deviation `std`, by the normal
+    """Return the interval of the `mean` of `count` values with the sample standard deviation `std`, from the normal
     distribution. Return None for fewer than two values.
     """
     if count < FEWEST:
@@ -58,8 +58,8 @@ def normal_mean(mean: float, std: float, count: int) -> Interval | None:
 
 def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> Interval | None:
     """Return the interval of the difference `second` - `first` of two means, each (mean, sample standard deviation, count).
-    The standard deviations may differ (B. L. Welch 1947). Counts are large, so the normal distribution takes the place of
-    Student's. Return None if a mean has fewer than two values.
+    The standard deviations may differ (B. L. Welch 1947). Counts are assumed to be large, so the normal distribution replaces
+    Student's t. Return None if a count is below 2.
     """
     if min(first[2], second[2]) < FEWEST:
         return None
@@ -69,8 +69,8 @@ def welch(first: tuple[float, float, int], second: tuple[float, float, int]) -> 
 
 
 def bootstrap_mean(values: Sequence[float], seed: int = 0) -> Interval | None:
-    """Return the percentile bootstrap interval of the mean of some values (B. Efron 1979), with a fixed seed; None for fewer
-    than two values.
+    """Return the percentile bootstrap interval of the mean of `values` (B. Efron 1979). The same `seed` gives the same
+    interval. Return None for fewer than two values.
     """
     if len(values) < FEWEST:
         return None

@@ -1,4 +1,4 @@
-"""Checks of values from JSON files, which may come from anywhere, against the form that the readers of a file rely on."""
+"""Checks that values from JSON files, which may be damaged or foreign, have the form on which the reading code relies."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,9 +6,9 @@ from typing import Any
 from legged.errors import ConfigError
 
 TEXT, NUMBER, POSITIVE, INDEX = "a text", "a number", "a number above 0", "a whole number of at least 0"
-"""Forms of single values. Numbers fit into a 32-bit float; those above 0 are above 1e-9."""
+"""Forms of single values. A number is below LARGEST in magnitude; a number above 0 is above SMALLEST."""
 ANY = "*"
-"""Stands for all names of a mapping."""
+"""Key in the form of a mapping that stands for all names in the mapping."""
 LARGEST, SMALLEST = 1e30, 1e-9
 ABSENT = object()
 """Stands for the value of a name that a mapping lacks."""
@@ -16,17 +16,17 @@ ABSENT = object()
 
 @dataclass(frozen=True)
 class OrNull:
-    """A value of a form, or null."""
+    """Form of a value that may be null and otherwise has the form `form`."""
 
     form: Any
 
 
 def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str = "") -> None:
-    """Check a value, which stands at `path` in its file.
+    """Check that a value has a form. `path` is the value's place in its file, for the message.
 
     `form` is one of the constants above, a set of allowed values, or an `OrNull`. A list of values is described by [form], by
-    [form, ...] if it may not be empty, or by a tuple with a form for each entry. A mapping is described by names and forms;
-    a name that ends in ? may be absent. `or_null` is added to the allowed values in a message.
+    [form, ...] if it may not be empty, or by a tuple with a form for each entry. A mapping is described by a mapping from
+    names to forms; a name that ends in ? may be absent. Messages add the text `or_null` to the name of the form.
 
     Raises:
         ConfigError: the value has another form. The message begins with `damaged`, which names the file and its damage.
@@ -67,6 +67,6 @@ def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str
 
 
 def wrong_form(damaged: str, path: str, wanted: str, value: Any) -> ConfigError:
-    """Return the error for a value that has another form than `wanted`."""
+    """Return the error for a value whose form is not `wanted`."""
     given = "nothing" if value is None or value is ABSENT else f"{type(value).__name__} {str(value)[:40]!r}"
     return ConfigError(f"{damaged}: {path}: expected {wanted}, got {given}")

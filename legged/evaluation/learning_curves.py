@@ -1,4 +1,4 @@
-"""Learning curves: the scalars in the TensorBoard files of runs, and charts of one run or of several runs."""
+"""Learning curves: scalars from the TensorBoard files of runs, and charts of them for one run or for several runs."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +16,9 @@ from legged.figures import COLORS
 from legged.learning.run_folder import CONFIG_FILE
 
 SAME_TIME = 0.05
-"""Largest relative difference between the runs' times of an iteration with which the runs share a time axis."""
+"""Runs share a time axis if their mean times of an iteration differ by at most this share."""
 MOST_PARTS = len(COLORS) - 1
-"""Largest number of reward parts with their own colour; the smaller parts are summed."""
+"""Largest number of parts of the reward that have their own colour. Smaller parts are summed."""
 EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
 """Prefixes of tags; `WATCHED` is the prefix of evaluations during training."""
 SINGLE = ("Metrics/lin_vel_rmse", "Metrics/ang_vel_rmse", "Metrics/falls")
@@ -41,7 +41,7 @@ TITLES = {
     "Evaluation/return": ("evaluated: return of an episode", 1.0),
     "Evaluation/episode_length": ("evaluated: length of an episode [control steps]", 1.0),
 }
-"""Tag -> title of its chart and factor on its values. The charts of other tags are titled with the tag's name."""
+"""Tag -> title of its chart and factor on its values. The chart of any other tag has the tag's name as its title."""
 Curve = tuple[np.ndarray, np.ndarray]
 """Iterations and values."""
 Scalars = dict[str, Curve]
@@ -70,7 +70,7 @@ def read_scalars(run: Path) -> Scalars:
     """Read all scalars of a run folder.
 
     Raises:
-        ConfigError: the folder holds no TensorBoard file, or one without values.
+        ConfigError: the folder holds no TensorBoard file, or its file has no values.
     """
     if not list(run.glob("events.out.tfevents.*")):
         raise ConfigError(f"{run}: holds no TensorBoard file")
@@ -81,13 +81,13 @@ def read_scalars(run: Path) -> Scalars:
         entries = events.Scalars(tag)
         found[tag] = (np.array([e.step for e in entries]), np.array([e.value for e in entries]))
     if not found:
-        raise ConfigError(f"{run}: its TensorBoard file holds no values; the training ended before its first iteration did")
+        raise ConfigError(f"{run}: its TensorBoard file holds no values, because the training ended in its first iteration")
     return found
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """Return the configuration in a run folder without checking it, because an older version may have written it; an empty
-    mapping if it can't be read.
+    """Return the configuration in a run folder. It is not checked, because an older version may have written it. Return an
+    empty mapping if it can't be read.
     """
     try:
         return read_yaml(run / CONFIG_FILE)
@@ -96,8 +96,8 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a label for each run: task, run name and seed. Without a configuration the label is the folder's name. If two
-    labels would be equal, the folder's name is added to both.
+    """Return a label for each run: task, run name and seed, or the folder's name if the configuration is empty. If two labels
+    are equal, the folder's name is added to both, and then a number if they are still equal.
     """
     found, names = [], [folder.resolve().name for folder in folders]
     for folder, config in zip(names, configs, strict=True):
@@ -109,17 +109,17 @@ def labels(folders: Sequence[Path], configs: Sequence[dict[str, Any]]) -> list[s
 
 
 def always_promoted(config: dict[str, Any]) -> float | None:
-    """Return the mean terrain level that robots reach if they are always promoted, on terrain of R rows: 2 (R - 1) / 3. From
-    the top row robots move to a random row, so the number of robots in row r is proportional to r + 1. Return None if R is
-    not known.
+    """Return the mean terrain level of robots that are promoted after every episode: 2 (R - 1) / 3 for R rows. Robots that
+    finish the last row start again in a random row, so the number of robots in row r is proportional to r + 1. Return None
+    if R is not known.
     """
     rows = value_at(config, "terrain.num_rows")
     return 2.0 * (rows - 1) / 3.0 if isinstance(rows, int) else None
 
 
 def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
-    """Return the running mean over `width` values; the window is shorter at the ends. Values that are not finite are left
-    out; the mean is NaN where the window has no finite value.
+    """Return the running mean over `width` values (n,); the window is shorter at the ends. Values that are not finite are
+    left out. Where the window has no finite value, the mean is NaN.
     """
     if not len(values):
         return values
@@ -130,14 +130,14 @@ def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
 
 
 def common(curves_of: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the iterations that all curves have, and the values of the curves at them, (curves, iterations)."""
+    """Return the iterations (I,) that all C curves have, and the values (C, I) of the curves at these iterations."""
     found = [dict(zip(*curve, strict=True)) for curve in curves_of]
     steps = sorted(set.intersection(*map(set, found))) if found else []
     return np.array(steps), np.array([[values[step] for step in steps] for values in found]).reshape(len(found), len(steps))
 
 
 def mean_of(runs: list[Scalars], tag: str) -> Curve:
-    """Return the mean curve of all runs that have this tag, at the iterations that they share, counted from 1."""
+    """Return the mean curve of all runs that logged `tag`, at the iterations that these runs share, counted from 1."""
     steps, values = common([run[tag] for run in runs if tag in run])
     return steps + 1, values.mean(axis=0) if len(steps) else steps
 
@@ -151,7 +151,7 @@ def times_of(scalars: Scalars) -> Curve:
 
 def common_time(runs: Collection[Scalars]) -> float | None:
     """Return the mean time of an iteration [s] in the first run that logged times. Return None if no run logged times, or if
-    the means of the runs differ by more than `SAME_TIME`.
+    the runs' mean times differ by more than the share `SAME_TIME`.
     """
     found = [float(seconds.mean()) for _, seconds in map(times_of, runs) if seconds.size]
     alike = bool(found) and min(found) > 0.0 and max(found) <= (1.0 + SAME_TIME) * min(found)
@@ -162,19 +162,19 @@ def common_time(runs: Collection[Scalars]) -> float | None:
 
 
 def curves_of_run(log: Log) -> list[str]:
-    """Return all charts of one run, as SVG."""
+    """Return all charts of one run, each as an SVG."""
     run, parts = [("", log)], _parts(log.scalars)
     drawings = [curves(chart) for chart in (*outcomes(run), *_learner(run), *levels([log]))]
     return [*drawings[:1], *([parts] if parts else []), *drawings[1:]]
 
 
 def curves_of_runs(runs: Named) -> list[str]:
-    """Return charts with the curves of several runs in the same axes, as SVG."""
+    """Return charts, each as an SVG, that show the curves of several runs in the same axes."""
     return [curves(chart) for chart in (*outcomes(runs), *_learner(runs), *_one("Terrain/level", "mean terrain level", runs))]
 
 
 def outcomes(runs: Named) -> list[Chart]:
-    """Return charts of what robots do: returns, errors, falls and metrics of the task."""
+    """Return charts of the robots' performance: returns, errors, falls and metrics of the task."""
     steps = {log.dt for _, log in runs}
     dt = next(iter(steps)) if len(steps) == 1 else None
     others = [tag for tag in _tags(runs, "Metrics/") if tag not in (*NOT_OF_THE_TASK, *SINGLE, *CURRICULUM)]
@@ -187,7 +187,7 @@ def outcomes(runs: Named) -> list[Chart]:
 
 
 def _learner(runs: Named) -> list[Chart]:
-    """Return charts of the curriculum of commands, of evaluations during training and of the optimiser."""
+    """Return charts of the command curriculum, of evaluations during training, and of the learning algorithm."""
     wanted = {value_at(log.config, "train.algorithm.desired_kl") for _, log in runs} - {None}
     level = ("desired_kl", float(wanted.pop())) if len(wanted) == 1 else None
     return [
@@ -204,7 +204,7 @@ def _tags(runs: Named, beginning: str) -> list[str]:
 
 
 def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
-    """Return the charts of the quantities with these tags."""
+    """Return a chart for each of these tags that a run logged."""
     names = {tag: "evaluated: " * tag.startswith(WATCHED) + tag.partition("/")[2].replace("_", " ") for tag in tags}
     titles = {tag: TITLES.get(tag, (name, 1.0)) for tag, name in names.items()}
     return [chart for tag, (title, factor) in titles.items() for chart in _one(tag, title, runs, factor, **how)]
@@ -213,8 +213,8 @@ def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
 def _one(
     tag: str, title: str, runs: Named, factor: float = 1.0, exact: bool = False, markers: bool = False, **look: Any
 ) -> list[Chart]:
-    """Return a list with the chart of one quantity, with a line for each run; an empty list if no run logged the quantity.
-    Lines are running means unless `exact`.
+    """Return a list with one chart, which has a line for each run that logged `tag`; an empty list if no run logged it. Lines
+    are running means unless `exact` is set.
     """
     lines = []
     for i, (label, run) in enumerate(runs):
@@ -226,7 +226,7 @@ def _one(
 
 
 def _returns(runs: Named) -> list[Chart]:
-    """Return the chart of returns. If there is only one run, a band shows the standard deviation over episodes."""
+    """Return a list with the chart of returns. If there is one run, a band shows the standard deviation over episodes."""
     charts = _one("Train/mean_reward", "return of an episode", runs)
     std = runs[0][1].scalars.get("Train/std_reward")
     if not charts or len(runs) > 1 or std is None:
@@ -239,7 +239,7 @@ def _returns(runs: Named) -> list[Chart]:
 
 
 def _parts(scalars: Scalars) -> str:
-    """Return a chart (SVG) of the stacked reward parts; an empty text if no part was logged."""
+    """Return an SVG of the parts of the reward as stacked areas; an empty text if no part was logged."""
     names = [tag.removeprefix(EPISODE) for tag in scalars if tag.startswith(EPISODE)]
     steps, values = common([scalars[EPISODE + name] for name in names])
     smoothed = [smooth(part) for part in values]
@@ -256,8 +256,8 @@ def _parts(scalars: Scalars) -> str:
 
 
 def levels(logs: Sequence[Log]) -> list[Chart]:
-    """Return charts of the terrain level by type, and of the shares of episodes after which a robot moves up or down. Values
-    are means over the runs. There is no chart without a terrain curriculum.
+    """Return charts, with a line for each terrain type, of the level and of the shares of episodes after which a robot moves
+    up or down. Values are means over the runs. The list is empty without a terrain curriculum.
     """
     scalars = [log.scalars for log in logs]
     types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]

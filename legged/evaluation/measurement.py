@@ -1,4 +1,4 @@
-"""Common parts of all measurements of a policy: the setting, the head of the result, and the count of lost contacts."""
+"""Common parts of all measurements of a policy: its setting, the first fields of a result, and the count of lost contacts."""
 
 import sys
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from legged.policies.restore import TrainedPolicy
 
 @dataclass(frozen=True)
 class Setting:
-    """A policy to measure, with changes to its configuration, and the folder of the result."""
+    """A policy to measure, the changes to its configuration, the device, and the folder of the result."""
 
     policy: TrainedPolicy
     device: torch.device
@@ -33,7 +33,7 @@ class Setting:
 
     @property
     def asked(self) -> list[tuple[str, Any]]:
-        """The overrides, preceded by the default engine of the device, which replaces the engine of the training."""
+        """The `overrides`, after an override that selects the device's default engine instead of the training's engine."""
         return [("sim.physics", resolve_physics("auto", self.device)), *self.overrides]
 
     @cached_property
@@ -52,20 +52,20 @@ class Setting:
 
     @property
     def head(self) -> dict[str, Any]:
-        """The first fields of every result; `changes` is not among them."""
+        """The fields with which every result begins: task, checkpoint, engine and device."""
         what = {"task": self.policy.cfg.task, "checkpoint": self.policy.checkpoint.name}
         return {**what, "physics": self.engine, "device": device_name(self.device)}
 
     @property
     def changes(self) -> dict[str, Any]:
-        """{"changes": field -> value of the overrides that change the conditions}; empty if none does."""
+        """{"changes": mapping from field to value} of the overrides that change the conditions; empty if none does."""
         changes = changes_of(self.overrides)
         return {"changes": changes} if changes else {}
 
 
 class Overflows:
-    """Number of pairs of a robot and a control step in which contacts were lost. It sums the task's own counts, which start
-    from zero with every logged rollout.
+    """Counts in how many control steps contacts were lost, summed over robots. It adds up the task's own counts, which the
+    task resets whenever it logs them.
     """
 
     NAME = "Metrics/contact_overflows"
@@ -74,17 +74,17 @@ class Overflows:
         self._logged: list[Tensor] = []
 
     def add(self, extras: dict[str, Any]) -> None:
-        """Add the count that a step returned, if the step ended a rollout."""
+        """Add the count in the `extras` of a control step, if the task logged in this step."""
         if "log" in extras:
             self._logged.append(extras["log"][self.NAME])
 
     def total(self, task: BaseTask) -> int:
-        """Return the number since the task was reset. It can be read only once."""
+        """Return the count since the first step. Call this only once, because it resets the task's count."""
         return int(sum(self._logged, task.metrics.flush()[self.NAME]))
 
 
 def warn_of_overflows(what: str, lost: int) -> None:
-    """Print a warning that results with lost contacts are not to be trusted."""
+    """Print a warning if contacts were lost `lost` times in the measurement `what`."""
     if lost:
-        said = f"contacts were lost for want of memory, {lost} times (robots x steps); raise sim.nconmax and sim.njmax"
+        said = f"contacts were lost {lost} times (robots x steps), because memory was full; raise sim.nconmax and sim.njmax"
         print(f"warning: {what}: {said}", file=sys.stderr)

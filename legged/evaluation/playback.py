@@ -1,4 +1,4 @@
-"""Playback of a policy in C MuJoCo: one robot on a plane, one command after another."""
+"""Playback of an ONNX policy in C MuJoCo: one robot on a plane follows one command after another."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from legged.policies.foreign import ForeignPolicy
 from legged.robots.robot import Robot
 
 SETTLING_S = 2.0
-"""Time after the start of a command from which on velocities are measured [s]."""
+"""Time from the start of a command to the start of the measurement [s]."""
 FALLEN = 1.0
 """Tilt of the base that counts as a fall [rad]."""
 SOLVER = SimConfig(physics="mujoco", iterations=50, ls_iterations=20)
@@ -34,7 +34,7 @@ class Moment(NamedTuple):
 
 
 class Stage:
-    """A robot on a plane, controlled by a policy whose layout of observations and actions is known."""
+    """A robot on a plane, controlled by a `ForeignPolicy`."""
 
     def __init__(self, robot: Robot, policy: ForeignPolicy, friction: float) -> None:
         """Build the model with `friction` between robot and ground."""
@@ -46,8 +46,8 @@ class Stage:
         self._start = _standing(self.model, robot, policy)
 
     def walk(self, command: np.ndarray, seconds: float) -> Iterator[Moment]:
-        """Yield a moment for each control step of a walk, starting in the default pose with the feet on the ground. The walk
-        ends after `seconds` or with a fall. `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
+        """Yield the state after each control step of a walk that starts in the default pose with the feet on the ground. The
+        walk ends after `seconds` or with a fall. `command` (3,) is vx, vy [m/s], yaw rate [rad/s].
         """
         model, policy, data = self.model, self.policy, mujoco.MjData(self.model)
         data.qpos[:] = self._start
@@ -67,18 +67,18 @@ class Stage:
                     data.ctrl[:] = np.clip(torques, -limits, limits)
                 mujoco.mj_step(model, data)
             state = lin_vel, ang_vel, gravity = _base(data)
-            fallen = not np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN  # NaN is a fall
+            fallen = not np.arccos(np.clip(-gravity[2], -1.0, 1.0)) <= FALLEN  # NaN counts as a fall
             yield Moment(float(data.time), np.array([*lin_vel[:2], ang_vel[2]]), float(data.qpos[2]), fallen)
 
 
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[dict[str, Any]]:
-    """Play every command for `seconds` at the given friction, from the default pose with the feet on the ground.
+    """Play every command for `seconds`, from the default pose on the ground. `friction` is that of robot and ground.
 
-    Return for each command a mapping: `command`; `velocity`, the mean after SETTLING_S in the base frame [m/s, m/s, rad/s];
-    `lowest_base`, the least height of the base after SETTLING_S [m]; and `fell_after`, the time of a fall [s]. Without a fall
-    `fell_after` is None; with a fall `velocity` and `lowest_base` are None.
+    Return a mapping for each command. `velocity` is the mean after SETTLING_S in the base frame [m/s, m/s, rad/s] and
+    `lowest_base` the smallest height of the base after SETTLING_S [m]; both are None if the robot fell. `fell_after` is the
+    time of the fall [s], or None. `command` is the command.
     """
     stage, rows = Stage(robot, policy, friction), []
     for command in commands:
@@ -93,9 +93,9 @@ def play(
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
-    """Return the errors on the commands of the grid, with one robot for each command. Errors of the horizontal velocity [m/s]
-    and of the yaw rate [rad/s] are root mean squares over the control steps after `grid.settle_s`, up to a fall. The result
-    holds mean and worst cell of both errors, the share of falls, and in "cells" the errors and the fall of each command.
+    """Measure the errors on the commands of the grid, with one robot for each. The errors of horizontal velocity [m/s] and
+    yaw rate [rad/s] are root mean squares over the control steps from `grid.settle_s` to a fall or the end. Return mean and
+    worst cell of both errors, the share of falls, and "cells", which has both errors and `fell` for each command.
     """
     stage, cells, rows = Stage(robot, policy, friction), grid.cells, []
     for command in cells:
@@ -119,7 +119,7 @@ def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> 
 
 
 def _base(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return linear and angular velocity [m/s, rad/s] and the unit vector along gravity, all in the base frame."""
+    """Return linear velocity [m/s], angular velocity [rad/s] and unit vector along gravity, each (3,), in the base frame."""
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, data.qpos[3:7])
     to_world = turn.reshape(3, 3)
@@ -127,7 +127,7 @@ def _base(data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _make_servos(model: mujoco.MjModel, policy: ForeignPolicy) -> None:
-    """Turn the motors of a model, in place, into position actuators; the integrator treats their damping implicitly."""
+    """Turn the motors of a model into position actuators, whose damping the integrator treats implicitly."""
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
     model.actuator_gainprm[:, 0] = policy.stiffness
@@ -138,12 +138,12 @@ def _make_servos(model: mujoco.MjModel, policy: ForeignPolicy) -> None:
 
 
 def _standing(model: mujoco.MjModel, robot: Robot, policy: ForeignPolicy) -> np.ndarray:
-    """Return positions (nq,) in the policy's default pose with the lowest shape 1 mm above the ground."""
+    """Return the positions (nq,) of the policy's default pose, with the lowest shape 1 mm above the ground."""
     data = mujoco.MjData(model)
     data.qpos[:] = robot.default_qpos
     data.qpos[list(robot.qpos_columns)] = policy.default
     low, high = 0.0, 10.0 * robot.file.spawn_height
-    for _ in range(40):  # bisection: `high` becomes the least height at which nothing touches the ground
+    for _ in range(40):  # bisection: `high` becomes the smallest height of the base without contacts
         data.qpos[2] = 0.5 * (low + high)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)

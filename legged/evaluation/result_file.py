@@ -1,4 +1,4 @@
-"""Files with the results of evaluations. A file is checked when it is read, because it may come from anywhere."""
+"""Files with the results of evaluations. A file is checked when it is read, because it may be damaged or foreign."""
 
 import json
 import math
@@ -13,14 +13,15 @@ from legged.evaluation.json_forms import ANY, NUMBER, TEXT, OrNull, check_form
 from legged.process.paths import make_folder, write_text
 
 CHANGED = "changed"
-"""Name of the folder for evaluations with changed fields; it lies next to the policy's other results."""
+"""Name of the folder, next to the policy's other results, for evaluations under changed conditions."""
 SAYS_NOTHING = ("sim.physics", "sim.solver", "sim.threads", "env.seed", "env.num_envs", "robot")
 """Fields that do not change the conditions of an evaluation."""
 SECTIONS_THAT_SAY_NOTHING = ("train.", "evaluation.")
-"""Sections that do not change the conditions either; the grid of commands is stored in the result itself."""
+"""Sections whose fields do not change the conditions. The section `evaluation` holds the grid of commands, which has its own
+place in a result."""
 
 BROKEN = (KeyError, TypeError, ValueError, IndexError, AttributeError)
-"""Errors that reading a result raises if the file lacks a part."""
+"""Errors that are raised when a missing part of a result is read."""
 
 ERRORS = {"mean": OrNull(NUMBER), "worst": OrNull(NUMBER)}
 SPREAD = dict.fromkeys(("mean", "std", "min", "max"), NUMBER)
@@ -39,24 +40,24 @@ SUCCESS: dict[str, Any] = {"success?": {"types": {ANY: TYPE}}}
 
 
 def changes_of(asked: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return field -> value of the overrides that change the conditions of an evaluation."""
+    """Return field -> value for those of the overrides that change the conditions of an evaluation."""
     said = ((field, value) for field, value in asked if field not in SAYS_NOTHING)
     return {field: value for field, value in said if not f"{field}.".startswith(SECTIONS_THAT_SAY_NOTHING)}
 
 
 def file_name(engine: str) -> str:
-    """Return the file name of an evaluation in an engine."""
+    """Return the name of the file with the evaluation in an engine."""
     return f"evaluation_{engine}.json"
 
 
 def stress_name(engine: str) -> str:
-    """Return the file name of a stress test in an engine."""
+    """Return the name of the file with the stress test in an engine."""
     return f"stress_{engine}.json"
 
 
 def kept_parts(path: Path, head: dict[str, Any]) -> dict[str, Any]:
-    """Return the parts of the result at `path` that follow its head. Return an empty mapping if its head, which names the
-    checkpoint, differs from `head`.
+    """Return the measured parts of the result at `path`. Return an empty mapping if there is no result, or if its first
+    fields, such as task and checkpoint, differ from `head`.
     """
     try:
         old = json.loads(path.read_text(encoding="utf-8"))
@@ -69,10 +70,10 @@ def kept_parts(path: Path, head: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Read the results in files and folders, each file once.
+    """Read the results at `paths`, which are files and folders. Each file is read once.
 
     Raises:
-        ConfigError: a path does not exist, or a folder or a file holds no evaluation.
+        ConfigError: a path does not exist or holds no evaluation.
     """
     results: dict[Path, dict[str, Any]] = {}
     for path in paths:
@@ -90,10 +91,10 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
 
 
 def check_result(result: Any, where: str) -> None:
-    """Check those fields of a result that comparisons read; `where` names the file.
+    """Check the fields of a result that comparisons read. `where` names the file in messages.
 
     Raises:
-        ConfigError: a field is missing or has another type.
+        ConfigError: a field is missing or has a wrong type.
     """
     damaged, there = f"{where}: is not the result of an evaluation", result if isinstance(result, dict) else {}
     alone = "success" in there and not TRACKING.keys() & there.keys()  # from `legged evaluate terrain`
@@ -102,12 +103,12 @@ def check_result(result: Any, where: str) -> None:
 
 
 def device_name(device: torch.device) -> str:
-    """Return the name of a GPU, or "cpu"."""
+    """Return the name of a device: the product name of a GPU, or "cpu"."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
 
 
 def write_result(path: Path, result: dict[str, Any]) -> None:
-    """Write a result as a JSON file, and make its folder if it is missing.
+    """Write a result as a JSON file, in a folder that is made if it is missing.
 
     Raises:
         RunError: the file can't be written.
@@ -117,12 +118,12 @@ def write_result(path: Path, result: dict[str, Any]) -> None:
 
 
 def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
-    """Return the part of a result that holds the errors on the grid of commands."""
+    """Return the part of a result that holds the tracking errors: "rough" if it exists, else the whole result."""
     return result.get("rough", result)
 
 
 def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
-    """Return the number of robots on a command grid that fell, and the number of all robots; None if the file lacks them."""
+    """Return how many robots fell on the grid of commands, and how many there were; None if the result lacks a number."""
     try:
         robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
         return (round(tracking["falls"] * robots), robots) if robots > 0 else None
@@ -136,12 +137,12 @@ def has_tracking(result: dict[str, Any]) -> bool:
 
 
 def changes_text(result: dict[str, Any]) -> str:
-    """Return the changed fields of an evaluation as text, 'sim.dt=0.002, terrain.scan=own'; empty without changes."""
+    """Return the changed fields of an evaluation as text: 'sim.dt=0.002, terrain.scan=own', or '' without changes."""
     return ", ".join(f"{field}={value}" for field, value in sorted(result.get("changes", {}).items()))
 
 
 def grid_text(result: dict[str, Any]) -> str:
-    """Return the grid of an evaluation as text, 'vx -1 to 1, vy 0, yaw 0 (5 commands)'; empty without a grid."""
+    """Return the grid of an evaluation as text: 'vx -1 to 1, vy 0, yaw 0 (5 commands)', or '' without a grid."""
     grid = tracking_of(result).get("grid", {})
     ends = {axis: sorted({min(values), max(values)}) for axis, values in grid.items()}
     parts = [f"{axis} {' to '.join(f'{value:g}' for value in values)}" for axis, values in ends.items()]

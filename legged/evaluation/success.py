@@ -2,8 +2,8 @@
 
 Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5; the largest sizes are harder than those of training.
 Robots start in the middle of a tile and keep their heading, with commands of 0.75 m/s forward and up to 0.1 m/s sideways.
-`Scores` defines success. The numbers here are for a robot half a metre high. For other robots lengths are multiplied by
-`terrain.scale` and velocities by its square root (constant Froude number).
+`Scores` defines success. The numbers in this file are for a robot half a metre high. For other robots lengths are multiplied
+by `terrain.scale` and velocities by its square root (constant Froude number).
 """
 
 import gc
@@ -41,9 +41,9 @@ from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_ty
 TILE = 8.0
 """Side of a tile [m]."""
 DISTANCE = 4.0
-"""Distance from the start that counts as success [m]: half a tile."""
+"""Distance from the start at which a robot succeeds [m]: half a tile."""
 TIME_S = 20.0
-"""Time limit for this distance [s]."""
+"""Time limit for DISTANCE [s]."""
 FORWARD, SIDEWAYS = 0.75, 0.1
 """Commanded forward velocity, and the largest commanded velocity to either side [m/s]."""
 SPAWN_RANGE = 0.1
@@ -63,17 +63,17 @@ SIZES: dict[str, tuple[float, ...]] = {
     "stepping_stones": (0.2, 0.3, 0.45, 0.75, 1.05, 1.35),
     "flat": (0.0,),
 }
-"""Terrain type -> the sizes that are measured with `--full`, in the type's unit."""
+"""Terrain type -> sizes that are measured with `--full`, in the type's unit."""
 FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("slope_up", "slope_down"), (10.0, 20.0, 25.0, 30.0)),
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (10.0, 20.0, 25.0)),
     **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
-"""Terrain type -> the sizes that are measured without `--full`, for types with fewer sizes then."""
+"""Terrain type -> sizes that are measured without `--full`, in the type's unit. Other types have those of SIZES."""
 SMALLEST = 0.001
-"""Smallest size that can be asked for, in the type's unit."""
+"""Smallest size that a user can choose, in the type's unit."""
 MOST_SIZES = 100
-"""Largest number of sizes of a type; the tiles of all its sizes lie in one height map."""
+"""Largest number of sizes of a type. It is limited because the tiles of all these sizes are in one height map."""
 TYPES_HELP = (
     "terrain types to cross, by default those of the training; a size or a range of sizes may follow a type, e.g."
     " stairs_up,kerbs=0.17,stairs_down=0.2:0.3:0.05"
@@ -92,24 +92,24 @@ PANELS = {
 
 
 class Scores:
-    """The first event of each of N robots: it gets far enough from its start, it falls (the task terminates it), or its time
-    is up, after TIME_S or by a time-out of the task. Later events do not count.
+    """Outcomes of N robots. The first event of a robot decides: it is far enough from its start (REACHED), the task ends its
+    episode as a failure (FELL), or its time is up, after TIME_S or by a time-out of the task (STUCK).
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
-        """Take robots that start at `start` (N, 2 or more), world frame [m], and succeed at a `distance` from there [m]."""
+        """Robots start at `start` (N, 2 or more), world frame [m], and succeed at `distance` [m] from their own start."""
         self._start, self._distance = start[:, :2].clone(), distance
         self._open = torch.ones(len(start), dtype=torch.bool, device=start.device)
         self.outcome = torch.full((len(start),), STUCK, device=start.device)
-        """(N,) REACHED, FELL or STUCK; robots without an event so far are STUCK."""
+        """(N,) REACHED, FELL or STUCK. Robots that have had no event yet count as STUCK."""
         self.time_s = torch.full((len(start),), TIME_S, device=start.device)
-        """(N,) time of the event [s]."""
+        """(N,) time of the event [s]; TIME_S without an event."""
 
     def update(self, time_s: float, base_pos: Tensor, terminated: Tensor, timed_out: Tensor) -> None:
-        """Update the outcomes after the control step that ends at `time_s` [s], from the positions of the bases (N, 3), world
-        frame [m], and the flags of robots that failed (N,) or timed out (N,) in this step.
+        """Update the outcomes after the control step that ends at `time_s` [s]. `base_pos` (N, 3) is in the world frame [m];
+        `terminated` and `timed_out` (N,) are flags of the robots whose episodes ended in this step.
         """
-        # A robot whose episode ended in this step is back at its start already, so its position does not count.
+        # A robot whose episode ended in this step has already been reset to its start, so its position does not count.
         ended = terminated | timed_out
         reached = self._open & ~ended & ((base_pos[:, :2] - self._start).norm(dim=1) >= self._distance)
         self.outcome.masked_fill_(reached, REACHED)
@@ -119,7 +119,7 @@ class Scores:
 
     @property
     def done(self) -> bool:
-        """True if every robot has had its event."""
+        """True if every robot has had its first event."""
         return not bool(self._open.any())
 
 
@@ -127,19 +127,19 @@ class Scores:
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of a terrain type, in its unit and in ascending order, for ground with that `terrain.scale`."""
+    """Return the sizes of a terrain type, ascending, in its unit; `full` as in `--full`. `scale` is `terrain.scale`."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
-    # A type that is not listed is measured at the sizes of difficulties up to 1, the hardest of training, and at one more.
+    # A type without a list is measured at the sizes of these difficulties; 1.2 is harder than training, which ends at 1.
     found = found or tuple(sorted(kind.size(d) for d in (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)))
     return found if kind.unit != METRES or scale == 1.0 else tuple(round(size * scale, 6) for size in found)
 
 
 def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float) -> dict[str, tuple[float, ...]]:
-    """Return terrain type -> sizes in its unit, in ascending order. The types are those in the comma-separated list `asked`,
-    by default those of the training (none on a plane).
+    """Return terrain type -> sizes in its unit, in ascending order. The types are those in the comma-separated list `asked`.
+    Without a list they are those of the training; a training on a plane has no terrain types.
 
-    Sizes may follow a type in the list: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Other types have the sizes of `sizes_of`.
+    Sizes may follow a type in the list: 'stairs_up=0.25', 'kerbs=0.1:0.2:0.05'. Without them, `sizes_of` gives the sizes.
 
     Raises:
         ConfigError: a type is unknown or comes twice, a size is out of bounds, or the policy cannot see terrain.
@@ -149,12 +149,12 @@ def chosen_sizes(cfg: LeggedConfig, asked: str | None, full: bool, scale: float)
     entries = [[part.strip() for part in entry.partition("=")] for entry in asked.split(",")]
     terrain_types("--types", ",".join(name for name, _, _ in entries))
     if cfg.terrain.mesh_type == "plane" and "heights" in cfg.observations.groups["actor"].terms:
-        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane, so its policy cannot use 'heights'")
+        raise ConfigError(f"--types: '{cfg.task}' was trained on a plane, so its policy has not learned to use 'heights'")
     return {name: _named_sizes(name, text) if given else sizes_of(name, full, scale) for name, given, text in entries}
 
 
 def _named_sizes(name: str, text: str) -> tuple[float, ...]:
-    """Return the sizes in the `text` '0.25' or '0.1:0.2:0.05', in the unit of the terrain type `name`."""
+    """Return the sizes that a `text` like '0.25' or '0.1:0.2:0.05' lists, in the unit of the terrain type `name`."""
     flag, kind = f"--types: {name}", TERRAIN_TYPES[name]
     given = low, high, _ = read_range(flag, text, f"{name}=0.1:0.2:0.05")
     if not SMALLEST <= low <= high <= kind.largest:
@@ -163,7 +163,7 @@ def _named_sizes(name: str, text: str) -> tuple[float, ...]:
 
 
 def trained_to(cfg: LeggedConfig) -> dict[str, float]:
-    """Return terrain type -> its size in the training's hardest row, in the type's unit; an empty mapping for a plane."""
+    """Return terrain type -> its size in the training's hardest row of tiles, in the type's unit; {} for a plane."""
     terrain = cfg.terrain
     if terrain.mesh_type == "plane":
         return {}
@@ -172,7 +172,7 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
 
 
 def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
-    """Return overrides for a task in which robots walk out of tiles along their initial heading."""
+    """Return overrides for a task in which robots walk out of their tiles and keep their initial heading."""
     return [
         *undisturbed(num_envs, TIME_S),
         *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
@@ -193,8 +193,8 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
-    """Measure one terrain type in a task that stands on `tiles_of_sizes`, with `robots` robots for each size. Return the
-    figures of each size, and the number of robot steps in which the engine dropped contacts because its memory was full.
+    """Measure success on one terrain type, with `robots` robots for each of the `sizes`. The task's terrain is that of
+    `tiles_of_sizes`. Return the figures of each size, and the number of times that a robot lost contacts in a step.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -203,8 +203,8 @@ def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robo
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
-    """Let all robots walk out of their tiles, `robots` of them on each kind of tile; return their scores, and how often a
-    robot lost contacts.
+    """Let all robots walk out of their tiles, with `robots` robots for each size. Return their scores, and the number of
+    times that a robot lost contacts in a step.
     """
     place(task, robots)
     task.reset()
@@ -224,7 +224,7 @@ def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
 
 
 def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
-    """Return the figures of the robots of one size, from their outcomes (n,) and times (n,) [s]."""
+    """Return the figures for one size, from the `outcomes` (n,) and `times` (n,) [s] of its robots."""
     reached, fell = outcomes == REACHED, int((outcomes == FELL).sum())
     return {
         "size": size,
@@ -235,7 +235,7 @@ def point(size: float, outcomes: Tensor, times: Tensor) -> dict[str, Any]:
 
 
 def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
-    """Return the share of the robots (n,) that were `successful`, with its interval, and the number of robots that `fell`."""
+    """Return the share of successful robots, with interval and counts, from flags `successful` (n,) and the count `fell`."""
     trials, successes = len(successful), int(successful.sum())
     low, high = wilson(successes, trials)
     share = successes / trials
@@ -243,8 +243,8 @@ def share_of(successful: Tensor, fell: int) -> dict[str, Any]:
 
 
 def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float]], robots: int) -> dict[str, Any]:
-    """Measure all `sizes` of each terrain type with `robots` robots for each size, and print a line for each type. Return the
-    part `success` of a result.
+    """Measure success for all `sizes` of each terrain type, with `robots` robots for each size. Print a line for each type.
+    Return the part "success" of a result.
     """
     cfg = setting.cfg  # overrides may change terrain.scale, and with it all lengths
     trained, scale = trained_to(setting.policy.cfg), cfg.terrain.scale  # type: ignore[arg-type]
@@ -277,10 +277,10 @@ def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float
 def _on_type(
     setting: Setting, name: str, sizes: Sequence[float], robots: int, changes: Sequence[tuple[str, Any]]
 ) -> tuple[list[dict[str, Any]], int]:
-    """Build the task for one terrain type and measure success; after the call nothing refers to the task."""
+    """Build the task for one terrain type and measure success. The task can be freed after the call."""
     cfg: Any = override(setting.policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
-    gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not hold two
+    gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not have the memory for two tasks
     task, act = restore(setting.policy, changes, setting.device, setting.graph, terrain)
     return measure_success(task, act, sizes, robots)
 
@@ -289,7 +289,7 @@ def _on_type(
 
 
 def print_success(success: dict[str, Any]) -> None:
-    """Print a table with a line for each point; sizes harder than those of training are marked."""
+    """Print a table with a line for each terrain type and size. Sizes that are harder than in training are marked with *."""
     rule, beyond = success["definition"], False
     title = f"success: {rule['distance_m']:.3g} m from the start within {rule['time_s']:g} s, asked for {rule['vx']:.3g} m/s"
     rows: list[list[str] | None] = []
@@ -310,16 +310,16 @@ def print_success(success: dict[str, Any]) -> None:
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Return whether a size is harder than the hardest of the training; False if the training lacks the terrain type."""
+    """Return whether a size is harder than `trained_to`, the hardest of the training; False if `trained_to` is None."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
-    grows = kind.size(1.0) >= kind.size(0.0)  # false for stepping stones, which get smaller
+    grows = kind.size(1.0) >= kind.size(0.0)  # false for stepping stones: smaller ones are harder
     return size > trained_to + 1e-9 if grows else size < trained_to - 1e-9
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result` and the results of other engines whose files lie next to `path` (evaluation_<physics>.json). Only
+    """Return `result`, and results in other engines from files (evaluation_<physics>.json) in the folder of `path`. Only
     results of the same checkpoint and with the same changed fields are returned.
     """
     found = [result]
@@ -334,8 +334,8 @@ def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any
 
 
 def draw_success(results: list[dict[str, Any]], path: Path) -> None:
-    """Draw success over size with its intervals into a PNG file: a panel for each kind of terrain, a line for each type and
-    engine.
+    """Draw success and its intervals over size into a PNG file. A panel (see `panels_of`) has a line for each terrain type
+    and engine.
     """
     rule, robots = results[0]["success"]["definition"], results[0]["success"]["robots_per_point"]
     reached = f"get {rule['distance_m']:.3g} m from their start within {rule['time_s']:g} s"
@@ -343,7 +343,7 @@ def draw_success(results: list[dict[str, Any]], path: Path) -> None:
 
 
 def success_charts(results: Sequence[dict[str, Any]]) -> list[Chart]:
-    """Return a chart for each kind of terrain: success over size, with one line for each type and engine."""
+    """Return a chart of success over size for each panel of `panels_of`, with a line for each terrain type and engine."""
     found = []
     for title, types in panels_of([name for result in results for name in types_in(result)]).items():
         lines = []
@@ -362,7 +362,7 @@ def types_in(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def success_line(label: str, entry: dict[str, Any]) -> Line:
-    """Return the line of success over size for one terrain type; its band shows the intervals, if the file has them."""
+    """Return the line of success over size for one terrain type. A band shows the intervals if `entry` has them."""
     points = sorted(entry["points"], key=lambda point: point["size"])
     banded = all(isinstance(point.get(key), int | float) for point in points for key in ("low", "high"))
     keys = ("size", "share", "low", "high") if banded else ("size", "share")
@@ -371,8 +371,8 @@ def success_line(label: str, entry: dict[str, Any]) -> Line:
 
 
 def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
-    """Return the chart of success over the size of a terrain type, from pairs of an entry of a result and its line. A dotted
-    line marks the hardest size of the training. If runs differ in it, each has its dotted line, which is named after the run.
+    """Return the chart of success over size. `lines` pairs a terrain type's entry in a result with its line. A dotted line
+    marks the hardest size of the training. If lines differ in that size, the names of the lines label the dotted lines.
     """
     ends: dict[float, list[str]] = {}
     for entry, line in lines:
@@ -386,7 +386,7 @@ def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> C
 
 
 def panels_of(names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return title of a panel -> its terrain types, for the types in `names`."""
+    """Return title of a panel -> its terrain types, for the types in `names`. Related types share a panel, as in PANELS."""
     there = dict.fromkeys(names)
     shared = {title: tuple(name for name in types if name in there) for title, types in PANELS.items()}
     alone = [name for name in there if name not in chain.from_iterable(PANELS.values())]

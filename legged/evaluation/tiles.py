@@ -1,4 +1,4 @@
-"""Terrain tiles for measurements, which replace those of the training."""
+"""Terrain for measurements, which replaces the terrain of the training."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -14,19 +14,19 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 BORDER = 3.0
 """Width of the level ground around the outer tiles [m]."""
 ROUGH_SPAWN = 2.0
-"""Largest distance of a robot's start from the middle of rough ground, in x and in y, so that bumps differ [m]."""
+"""Largest distance of a robot's start from the middle of rough ground, in x and in y [m]. Robots start on different bumps."""
 ROUGH_ROOM = 1.5
-"""Margin of rough ground beyond the farthest point of a command [m]."""
+"""Margin of rough ground beyond the farthest point that a command leads to [m]."""
 VARIANTS = 16
-"""Number of different tiles of each size, for random types. Robots are distributed over them, because a single tile may have
-an easy way out.
+"""Number of different tiles of each size, for terrain types with random shapes. Robots are distributed over these tiles,
+because a single tile may have an easy way out.
 """
 
 
 def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple[str, Any]]:
-    """Return overrides for a task on tiles with sides of `side` [m]; the policy's observations stay as trained.
+    """Return overrides for a task on tiles with sides of `side` [m], which the caller builds. Observations do not change.
 
-    The caller builds the tiles. The configuration describes a single level tile, which passes the check of the ground's size.
+    The overrides themselves describe one level tile, which is small enough for the check of the terrain's size.
     """
     return [
         ("terrain.mesh_type", "height_map"),
@@ -43,12 +43,12 @@ def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple
 
 
 def dividing_cell(length: float, cell: float) -> float:
-    """Return the edge of the largest cells up to `cell` [m] that divide `length` [m]."""
+    """Return the largest edge of a cell, at most `cell` [m], of which `length` [m] is a multiple."""
     return length / ceil(length / cell - 1e-6)
 
 
 def cell_for(name: str, cfg: TerrainConfig) -> float:
-    """Return the edge of a terrain type's height-map cells [m]: the training's, or less to divide the type's features."""
+    """Return the edge of a terrain type's height-map cells [m]: the training's, or less so that features are whole cells."""
     kind = TERRAIN_TYPES[name]
     if not kind.exact or kind.finest is None:
         return cfg.horizontal_scale
@@ -56,24 +56,24 @@ def cell_for(name: str, cfg: TerrainConfig) -> float:
 
 
 def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build one level tile with bumps for all robots of a grid. The tile's size is that in `cfg` (see `rough_side`)."""
+    """Build one level tile with bumps, on which all robots of a grid walk. `cfg` holds the tile's size (see `rough_side`)."""
     return Terrain.of_tiles([[TileSpec("rough_slope_up", 0.0)]], cfg, np.random.default_rng(seed))
 
 
 def rough_side(grid: Grid) -> float:
-    """Return a side that keeps all robots on the tile while they follow their commands [m]: 20 m for 1.4 m/s and 4 s."""
+    """Return the side of a tile that robots do not leave while they follow the commands [m]: 20 m for 1.4 m/s and 4 s."""
     fastest = float(np.linalg.norm(grid.cells[:, :2], axis=1).max())
     return 2.0 * ceil(ROUGH_SPAWN + fastest * grid.hold_s + ROUGH_ROOM)
 
 
 def tiles_of_sizes(name: str, sizes: Sequence[float], cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build tiles of one type, in all its sizes, as `tiles_apart` arranges them."""
+    """Build tiles of one terrain type in all `sizes`, arranged by `tiles_apart`."""
     return tiles_apart([TileSpec(name, size) for size in sizes], cfg, seed)
 
 
 def tiles_apart(specs: Sequence[TileSpec], cfg: TerrainConfig, seed: int) -> Terrain:
-    """Build tiles of all `specs`: variant k of spec i lies in row 2 i and column 2 k. Level ground separates the tiles, so
-    that a robot has left its own tile before it reaches another.
+    """Build tiles of all `specs`: variant k of spec i is in row 2 i and column 2 k. Level tiles lie between them, so that a
+    robot leaves its own tile before it reaches the next.
     """
     variants = 1 if all(TERRAIN_TYPES[spec.type].regular for spec in specs) else VARIANTS
     rows = [[TileSpec("flat", 0.0)] * (2 * variants - 1) for _ in range(2 * len(specs) - 1)]

@@ -13,7 +13,7 @@ from legged.envs.legged_checks import check_grid
 from legged.errors import ConfigError
 
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
-"""Commands and their units."""
+"""Names of the commands, which are the axes of the grid, and their units."""
 AXIS = "-1:1:0.5"
 """Default range of an axis, low:high:step."""
 MOST_ROBOTS = 2**20
@@ -24,13 +24,13 @@ MOST_VALUES = 10_000
 
 @dataclass(frozen=True)
 class Grid:
-    """Commands vx, vy [m/s] and yaw rate [rad/s]: each combination of their values is a cell, which `robots` robots hold."""
+    """Values of the commands vx, vy [m/s] and yaw rate [rad/s]. Each combination of values is a cell, that is one command."""
 
     vx: Sequence[float]
     vy: Sequence[float]
     yaw: Sequence[float]
     robots: int = 16
-    """Number of robots in each cell."""
+    """Number of robots that follow each command."""
     hold_s: float = 4.0
     """Time for which a command is held [s]."""
     settle_s: float = 1.0
@@ -38,7 +38,7 @@ class Grid:
 
     @property
     def cells(self) -> np.ndarray:
-        """Return (C, 3) commands."""
+        """Return the commands (C, 3): vx, vy [m/s], yaw rate [rad/s]."""
         return np.array(list(product(self.vx, self.vy, self.yaw)), dtype=float)
 
     @property
@@ -66,7 +66,7 @@ def axis_values(flag: str, text: str) -> list[float]:
     """Read the values of an axis: '-1:1:0.5' gives [-1, -0.5, 0, 0.5, 1], and a single number gives one value.
 
     Raises:
-        ConfigError: the text has another form.
+        ConfigError: the text does not have this form, or a command is too large.
     """
     given = low, high, _ = read_range(flag, text, f"{flag}=-1:1:0.5")
     if max(abs(low), abs(high)) > FASTEST:
@@ -78,7 +78,7 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
     """Read (low, high, step) from 'low:high:step', or from a single number, which is both low and high.
 
     Raises:
-        ConfigError: the text has another form.
+        ConfigError: the text does not have this form.
     """
     try:
         parts = [float(part) for part in text.split(":")]
@@ -92,7 +92,7 @@ def read_range(flag: str, text: str, example: str) -> tuple[float, float, float]
 
 
 def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
-    """Return name of an axis -> its values, for the grid in a task's configuration.
+    """Return name of an axis -> its values, for the grid in a task's configuration (`evaluation`).
 
     Raises:
         ConfigError: an axis is not a range, or has too many values.
@@ -105,7 +105,7 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
 def spaced(
     where: str, text: str, given: Sequence[float], what: str = "cells of this axis alone", most: int = MOST_VALUES
 ) -> list[float]:
-    """Return the values of the range `given` (low, high, step). `where`, `text` and `what` are used in error messages.
+    """Return the values of the range `given` (low, high, step). `where`, `text` and `what` are words for error messages.
 
     Raises:
         ConfigError: the range has more than `most` values.
@@ -134,7 +134,7 @@ def check_size(grid: Grid) -> None:
 
 
 def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
-    """Return mean, worst value and worst cell of `values` (C,) over the `cells` (C, 3), without NaN; null if all are NaN."""
+    """Return mean, worst value and worst cell of `values` (C,) over `cells` (C, 3). NaN is left out; None if all are NaN."""
     if np.isnan(values).all():
         return {"mean": None, "worst": None, "worst_cell": None}
     worst = int(np.nanargmax(values))
@@ -142,5 +142,5 @@ def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
 
 
 def number_or_null(value: float) -> float | None:
-    """Return a value for a JSON file: null (None) if it is not finite."""
+    """Return a value for a JSON file: the number, or None (null) if it is not finite."""
     return float(value) if np.isfinite(value) else None

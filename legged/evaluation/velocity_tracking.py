@@ -30,21 +30,21 @@ from legged.terrain import Terrain
 
 GRAVITY = 9.81
 SLOWEST = 0.1
-"""Speed below which a robot has no cost of transport [m/s]."""
+"""Smallest mean speed for which a cost of transport is computed [m/s]."""
 GAIT = (
     ("duty factor", "duty_factor", 1.0, "{:.2f}"),
     ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
     ("base height", "base_height", 1.0, "{:.3f} m"),
     ("thigh or shank contact", "thigh_contact", 100.0, "{:.2f} % of steps"),
 )
-"""Figures of the gait: label, name in a cell, factor and format."""
+"""Figures of the gait: label in the table, name in a cell's result, factor and format."""
 PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
-"""Heat maps: figure of a cell, index of the command over which its mean is taken, command on the vertical axis, title."""
+"""Heat maps: figure that is drawn, index of the command over which it is averaged, command on the vertical axis, title."""
 
 
 def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
-    """Build a task of grid.num_envs robots and the policy that acts in it. The task stands on a plane or, if it has terrain,
-    on bumpy level ground.
+    """Build a task with grid.num_envs robots, and the policy. If the task has terrain, the robots stand on level ground with
+    bumps, otherwise on a plane.
     """
     changes, terrain = place_to_track(setting.policy.cfg, grid, setting.asked)  # type: ignore[arg-type]
     if terrain is not None:
@@ -55,8 +55,8 @@ def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
 def place_to_track(
     cfg: LeggedConfig, grid: Grid, asked: list[tuple[str, Any]]
 ) -> tuple[list[tuple[str, Any]], Terrain | None]:
-    """Return the overrides for a task of grid.num_envs undisturbed robots, followed by `asked`, and the ground. The ground is
-    level with bumps; it is None for a task on a plane.
+    """Return the overrides for a task of grid.num_envs undisturbed robots, followed by `asked`; and the terrain, which is
+    level ground with bumps, or None for a task on a plane.
     """
     changes = undisturbed(grid.num_envs, grid.hold_s)
     if cfg.terrain.mesh_type == "plane":
@@ -68,13 +68,13 @@ def place_to_track(
 
 @torch.inference_mode()
 def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, Any]:
-    """Run the grid on a task of grid.num_envs robots. Return the figures as numbers and lists for a JSON file; "cells" has an
-    entry for each cell.
+    """Measure a policy on the grid in a task of grid.num_envs robots. Return the figures as numbers and lists for a JSON
+    file; "cells" has an entry for each cell.
 
-    A robot is measured until it falls or its episode ends by a time-out. Errors are those at the ends of control steps. The
+    A robot is measured until its episode ends by a fall or a time-out. Errors are those at the end of each control step. The
     cost of transport uses the power in the last physics step of each control step, which is lower than the mean over all
-    physics steps. `contact_overflows` is the number of pairs of a robot and a step in which contacts were lost because memory
-    was full. `estimates` holds the errors of a policy with an estimator.
+    physics steps. `contact_overflows` counts how often a robot lost contacts in a control step, because memory was full.
+    `estimates` holds the errors of the policy's estimator, if it has one.
     """
     network = getattr(act, "network", None)
     estimated = EstimationErrors(task.observation_groups[ESTIMATED]) if isinstance(network, EstimatingModel) else None
@@ -104,9 +104,11 @@ def hold(
     hold_s: float,
     read: Callable[[TensorDict], dict[str, Tensor]],
 ) -> tuple[dict[str, Tensor], Tensor, int]:
-    """Let robots follow constant commands (N, 3) for `hold_s` [s]. After the first `settle_s` [s], `read` returns quantities
-    (N, ...) at each step, given the observations. Return the sums of these quantities over each robot's first episode, with
-    the number of summed `steps` (N,); the flags (N,) of robots that fell in it; and how often a robot lost contacts.
+    """Let robots follow constant commands (N, 3) for `hold_s` [s]. From `settle_s` [s] on, `read` is called with the
+    observations after each control step and returns name -> quantity (N, ...).
+
+    Return three things: the sums of these quantities over each robot's first episode, where "steps" (N,) is the number of
+    summed steps; flags (N,) of the robots that fell in this episode; and how often a robot lost contacts in a step.
     """
     task.reset()
     observations = task.hold_commands(commands)
@@ -126,7 +128,7 @@ def hold(
 
 
 def _now(task: LeggedRobot) -> dict[str, Tensor]:
-    """Return the quantities of a control step that are summed, each (N,) or (N, feet)."""
+    """Return name -> quantity, (N,) or (N, feet), after a control step; these quantities are summed over steps."""
     power = task.torques * task.dof_vel
     collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
     return {
@@ -143,14 +145,14 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
 
 
 def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tensor, measured_s: float) -> dict[str, Any]:
-    """Return the figures of each cell and of the whole grid; null if no robot stood long enough to be measured."""
+    """Return the figures of each cell and of the whole grid. A figure is None if every robot fell before it was measured."""
     cells = grid.cells
 
     def per_cell(values: Tensor) -> np.ndarray:
         return values.double().cpu().numpy().reshape(len(cells), grid.robots, *values.shape[1:])
 
     total = {name: per_cell(values).sum(axis=1) for name, values in sums.items()}
-    # If every robot of a cell fell before it was measured, the errors and the gait are NaN, because 0 would look perfect.
+    # If every robot of a cell fell before it was measured, its figures are NaN, because an error of 0 would look perfect.
     steps = np.where(total["steps"] > 0, total["steps"], np.nan)
     lin, ang = (np.sqrt(total[name] / steps) for name in ("lin", "ang"))
     speed = total["speed"] / steps
@@ -194,8 +196,8 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
 def estimation_errors(
     kind: type[BaseTask], names: Sequence[str], squares: Tensor, steps: Tensor
 ) -> dict[str, dict[str, Any]]:
-    """Return estimated term -> root mean square error over all robots and steps, and unit. `squares` (N, terms) are sums over
-    the `steps` (N,) of each robot. The error is null if there is no step.
+    """Return name of an estimated term -> `rmse`, the root mean square error over all robots and steps, and `unit`. `squares`
+    (N, terms) are sums of squared errors over the `steps` (N,) of each robot. Without a step `rmse` is None.
     """
     count = float(steps.double().sum())
     means = (squares.double().sum(dim=0) / max(count, 1.0)).tolist()
@@ -204,7 +206,7 @@ def estimation_errors(
 
 
 def print_tracking(result: dict[str, Any]) -> None:
-    """Print the figures over the grid, and the gait at 0.5 m/s."""
+    """Print a table of the figures over the grid, and of the gait at the command nearest to 0.5 m/s forward."""
     lin, ang, gait = result["rmse_lin"], result["rmse_ang"], result["gait"]
     title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}"
     if result["ground"]:
@@ -235,18 +237,20 @@ def _command(cell: list[float]) -> str:
 
 
 def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
-    """Return the mean of a figure over the command with index `over`, as (values of vx, values of the remaining command). It
-    is NaN where every robot fell before it was measured.
+    """Return the mean of the figure `name` over the command with index `over`. The result has vx along its first axis and the
+    remaining command along its second. It is NaN where every robot fell before it was measured.
     """
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # mean of no values
+        warnings.simplefilter("ignore", RuntimeWarning)  # numpy warns if all values of a mean are NaN
         return np.nanmean(values, axis=over)
 
 
 def draw_tracking(result: dict[str, Any], path: Path) -> None:
-    """Draw heat maps of the errors over (vx, vy) and over (vx, yaw rate), as means over the third command."""
+    """Draw heat maps of the velocity error over (vx, vy) and of the yaw rate error over (vx, yaw rate), both as means over
+    the third command.
+    """
     grid = result["grid"]
     with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
         for axis, (name, over, other, label) in zip(axes[0], PANELS, strict=True):
@@ -256,7 +260,7 @@ def draw_tracking(result: dict[str, Any], path: Path) -> None:
             axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
             axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
             axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
-            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # mean of no values, where all robots fell
+            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # values are NaN where all robots fell
             for (i, j), value in np.ndenumerate(values):
                 dark = value > 0.6 * largest
                 axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")

@@ -1,1 +1,1 @@
-"""Fitting of actuators to logs of a robot: reading logs, fitting models and measuring their errors."""
+"""Fitting of actuator models to logs of a robot."""

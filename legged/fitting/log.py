@@ -15,12 +15,12 @@ DRIVE = ("stiffness", "damping", "torque_limit")
 NEEDED, OPTIONAL = ("joint_names", *MEASURED), ("dt", "time", "run", *DRIVE)
 """Required and optional arrays of a file."""
 BLOCKS = 10
-"""Number of equal blocks of time in a run. Every `HELD_OUT`th block is held out."""
+"""Number of equal blocks of time in a run. Every `HELD_OUT`th block is held out from the fit."""
 HELD_OUT = 5
 FEWEST_HELD_OUT = 0.1
-"""Whole runs are held out only if they have at least this share of the samples."""
+"""Whole runs are held out only if these runs together have at least this share of all samples."""
 UNEVEN = 0.01
-"""Largest deviation of the time between samples, as a share of the mean time step."""
+"""Largest allowed deviation from the time step, as a share of it."""
 SHORTEST = 200
 """Smallest number of samples of a joint."""
 
@@ -42,7 +42,7 @@ class ActuatorLog:
     torque: np.ndarray
     """(T, D) measured torques [N m]."""
     stiffness: np.ndarray | None = None
-    """(D,) P gains of the drives [N m/rad], if known; `damping` are their D gains [N m s/rad]."""
+    """(D,) P gains of the drives [N m/rad], if known. `damping` (D,) holds the D gains [N m s/rad]."""
     damping: np.ndarray | None = None
     torque_limit: np.ndarray | None = None
     """(D,) torque limits of the drives [N m], if known."""
@@ -54,8 +54,8 @@ class ActuatorLog:
 
     @property
     def held_out(self) -> np.ndarray:
-        """Return the mask (T,) of held-out samples, about a fifth: whole runs, or every fifth block of time if there are few
-        runs or one run has nearly all samples.
+        """Return the mask (T,) of the samples that are held out from the fit, about a fifth of all. They are whole runs. If
+        there are fewer than five runs, or one run has nearly all samples, they are every fifth block of time.
         """
         runs, lengths = np.unique(self.run, return_counts=True)
         if len(runs) >= HELD_OUT:
@@ -82,7 +82,7 @@ class ActuatorLog:
         return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **chosen)
 
     def resampled(self, dt: float) -> "ActuatorLog":
-        """Return the log at samples `dt` [s] apart: measurements are interpolated linearly, targets are the last ones sent.
+        """Return the log resampled every `dt` [s]. Measurements are interpolated linearly; a target is the last one sent.
 
         Raises:
             ConfigError: the log's samples are further apart than `dt`.
@@ -90,7 +90,7 @@ class ActuatorLog:
         if np.isclose(dt, self.dt, rtol=UNEVEN):
             return replace(self, dt=dt)
         if dt < self.dt:
-            raise ConfigError(f"--dt: the log was sampled every {self.dt:g} s; must be at least that, got {dt:g}")
+            raise ConfigError(f"--dt: must be at least {self.dt:g} s (the time step of the log), got {dt:g}")
         parts: dict[str, list[np.ndarray]] = {name: [] for name in ("run", *MEASURED)}
         for number in np.unique(self.run):
             rows = np.flatnonzero(self.run == number)
@@ -106,7 +106,7 @@ class ActuatorLog:
 
 
 def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
-    """Return runs, preferably every fifth, that together have about a fifth of all samples, and their exact share."""
+    """Return indices of runs that together have about a fifth of all samples, and their exact share of the samples."""
     order = [i for first in reversed(range(HELD_OUT)) for i in range(first, len(lengths), HELD_OUT)]
     wanted, held, chosen = lengths.sum() / HELD_OUT, 0, []
     for i in order:
@@ -117,19 +117,20 @@ def _about_a_fifth(lengths: np.ndarray) -> tuple[list[int], float]:
 
 
 def read_log(path: Path) -> ActuatorLog:
-    """Return the log in a file: `joint_names` (D,), `target`, `position`, `velocity`, `torque` (T, D), and `dt` or `time`
-    (T,) [s]. Optional are `run` (T,), and `stiffness`, `damping` and `torque_limit` of the drives, a number or (D,).
+    """Read an .npz file. It must hold `joint_names` (D,) and `target`, `position`, `velocity` and `torque` (T, D), and either
+    `dt` [s] or `time` (T,) [s]. It may hold `run` (T,), and the drives' `stiffness`, `damping` and `torque_limit`, each (D,)
+    or one number for all joints.
 
     Raises:
-        ConfigError: an array is missing, has another shape or invalid numbers, or is sampled unevenly.
+        ConfigError: an array is missing, unknown, of a wrong shape or not finite, or the samples are not evenly spaced.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or 'no .npz file'}") from error
+        raise ConfigError(f"{path}: {error.strerror or 'is not an .npz file'}") from error
     except Exception as error:  # zipfile, numpy and zlib raise their own classes
-        raise ConfigError(f"{path}: no .npz file of plain arrays") from error
+        raise ConfigError(f"{path}: is not an .npz file of plain arrays") from error
     for name in arrays:
         if name not in NEEDED + OPTIONAL:
             raise ConfigError(f"{path}: unknown key '{name}'{suggest(name, NEEDED + OPTIONAL)}")
@@ -155,7 +156,7 @@ def read_log(path: Path) -> ActuatorLog:
         raise ConfigError(f"{path}: target: {shape[0]} samples are too few; at least {SHORTEST} are needed")
     arrays.setdefault("run", np.zeros(shape[0]))
     run = numbers("run", f"({shape[0]},)", shape[:1])
-    # A run number that occurs again, as in concatenated logs, is another run.
+    # If a run number comes back after another one, as in concatenated logs, it counts as a new run.
     run = np.concatenate([[0], np.cumsum(run[1:] != run[:-1])])
     for name in (name for name in DRIVE if name in arrays):
         values = numbers(name, f"a number or ({len(names)},)", (), (1,), count)
@@ -176,27 +177,27 @@ def read_log(path: Path) -> ActuatorLog:
 
 
 def check_alike(log: ActuatorLog, path: Path) -> None:
-    """Check that the torques of a log vary, and that its joints have the same gains and limits: one drive is fitted to all.
+    """Check that one drive can be fitted to a log: its torques vary, and its joints have the same gains and torque limits.
 
     Raises:
-        ConfigError: the torques are constant, or the joints differ.
+        ConfigError: the torques are constant, or the joints differ in a gain or in the torque limit.
     """
     fitted_to = log.torque[~log.held_out]
     if fitted_to.min() == fitted_to.max():
         raise ConfigError(f"{path}: torque: is {fitted_to[0, 0]:g} N m throughout; nothing can be fitted to that")
-    for name in DRIVE if log.has_gains else DRIVE[2:]:  # the fit ignores one gain without the other
+    for name in DRIVE if log.has_gains else DRIVE[2:]:  # the fit uses gains only if both are known
         values = getattr(log, name)
         if values is None or np.allclose(values, values[0], rtol=1e-4, atol=0.0):
             continue
         low, high = int(values.argmin()), int(values.argmax())
         raise ConfigError(
             f"{path}: {name}: {values[low]:.4g} at {log.joint_names[low]}, {values[high]:.4g} at {log.joint_names[high]}; one"
-            " drive is fitted to all joints, so choose joints with equal values with --joints"
+            " drive is fitted to all joints, so use --joints to select joints with equal values"
         )
 
 
 def _even_step(time: np.ndarray, run: np.ndarray, path: Path) -> float:
-    """Return the time between two samples at the times `time` (T,) [s], which must not change within a run."""
+    """Return the time step [s] of samples taken at `time` (T,) [s]. The time step must be constant within each run."""
     steps = np.diff(time)[np.diff(run) == 0]
     if not len(steps):
         raise ConfigError(f"{path}: run: no two consecutive samples have the same run, so 'time' does not give a time step")

@@ -12,20 +12,20 @@ from mujoco.minimize import least_squares
 from legged.fitting.log import ActuatorLog
 
 SEEN = 0.002
-"""Share of samples at the motor's limit below which the limit is not identified."""
+"""The motor's torque-speed line is identified only if it limits at least this share of the samples."""
 PEAK, LIMITS = ("breakaway", "stribeck_velocity"), ("stall_torque", "no_load_speed")
-"""Parameters of a friction peak and of a motor's torque-speed line, which a fit may leave out."""
+"""Parameters that a fit may leave out: those of a friction peak, and those of the motor's torque-speed line."""
 MOST_SAMPLES = 40_000
-"""Number of samples in each of the last searches, spread over the log."""
+"""A search uses about this many samples at most. They are spread evenly over the log."""
 ROUGHLY = 4_000
-"""Number of samples in the first search, which tries all delays."""
+"""The same limit for the first searches, which try all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
 WORTH = 0.005
-"""Share of the squared error that a friction peak at low speed must explain to be identified."""
+"""A friction peak at low speed is identified only if it reduces the squared error by at least this share."""
 NARROWEST, WIDEST = 0.5 * SMOOTHING, 0.1
 """Range of identifiable Stribeck velocities. It begins at NARROWEST [rad/s], because friction fades below that speed. It ends
-at the share WIDEST of the largest speed, because a wider "peak" would fit other effects of speed."""
+at WIDEST times the largest speed, because a wider "peak" would fit other effects of speed."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Drive:
     """[s]"""
 
     def torques(self, error: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return torques [N m] for errors of the delayed target [rad] and velocities [rad/s]."""
+        """Return the torques [N m] for position errors (delayed target - position) [rad] and velocities [rad/s]."""
         asked = self.stiffness * error - self.damping * velocity
         low: float | np.ndarray = -self.effort
         high: float | np.ndarray = self.effort
@@ -66,19 +66,19 @@ class Drive:
         return np.clip(asked, low, high) - self.friction(velocity)
 
     def friction(self, velocity: np.ndarray) -> np.ndarray:
-        """Return the friction torque [N m]."""
+        """Return the friction torques [N m] at velocities [rad/s]."""
         slow = np.exp(-((velocity / self.stribeck_velocity) ** 2))
         dry = self.coulomb + (self.breakaway - self.coulomb) * slow
         return dry * np.tanh(velocity / SMOOTHING) + self.viscous * velocity
 
     def predict(self, log: ActuatorLog) -> np.ndarray:
-        """Return the torques (T, D) of a log [N m]."""
+        """Return the drive's torques (T, D) [N m] for the targets, positions and velocities of a log."""
         return self.torques(delayed(log, self.delay / log.dt) - log.position, log.velocity)
 
 
 def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
-    """Return the targets (T, D) of a log, delayed by a number of samples and interpolated linearly. Before the delay has
-    passed, a run has its first target.
+    """Return the targets (T, D) of a log [rad], delayed by a number of samples and interpolated linearly. Each run has its
+    first target until the delay has passed.
     """
     first = np.maximum.accumulate(np.where(np.r_[True, np.diff(log.run) != 0], np.arange(len(log.run)), 0))
     whole = int(np.floor(samples))
@@ -89,9 +89,9 @@ def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
 
 
 def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
-    """Return the drive with the smallest error on a log's torques, without the held-out samples. Gains in the log are kept.
-    Without gains, the damping includes the viscous friction, which cannot be identified separately. Breakaway friction equals
-    Coulomb friction unless the log shows a peak at low speed.
+    """Fit a drive to the torques of a log, without the held-out samples; delays are at most `longest_delay` [s]. If the log
+    holds both gains, they are kept. Otherwise the damping includes the viscous friction, which cannot be identified
+    separately. Breakaway friction equals Coulomb friction unless the log shows a friction peak at low speed.
     """
     every = np.flatnonzero(~log.held_out)
     effort = np.inf if log.torque_limit is None else float(log.torque_limit.max())
@@ -106,7 +106,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
         free = (*gains, "coulomb", *(PEAK if peaked else ()), *(LIMITS if limited else ()))
         return _search(replace(start, delay=samples * log.dt), error, velocity, torque, free)
 
-    # First search the delay in whole samples, with and without the motor's limit.
+    # The first searches try every delay in whole samples, with and without the motor's torque-speed line.
     start = _start(log, effort)
     torques, speeds = np.abs(log.torque[every]), np.abs(log.velocity[every])
     limits = replace(start, stall_torque=1.2 * torques.max(), no_load_speed=1.5 * max(speeds.max(), 1.0))
@@ -114,7 +114,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     tried = [search(float(k), of, of is limits, ROUGHLY) for k in delays for of in (start, limits)]
     best = min(tried, key=lambda one: one[0])[1]
     free = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
-    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # the line limits, not the effort
+    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # limited by the torque-speed line
     limited = bool(np.isfinite(best.stall_torque)) and float(np.mean(reduced)) >= SEEN
     best = best if limited else free
     found = search(best.delay / log.dt, best, limited)
@@ -130,7 +130,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
 
 
 def _start(log: ActuatorLog, effort: float) -> Drive:
-    """Return the start of the search: known gains or those of a linear regression, and little friction."""
+    """Return the first drive of the search: with the log's gains or those of a linear regression, and little friction."""
     if log.stiffness is not None and log.damping is not None:
         stiffness, damping = float(log.stiffness.mean()), float(log.damping.mean())
     else:
@@ -143,8 +143,8 @@ def _start(log: ActuatorLog, effort: float) -> Drive:
 def _search(
     start: Drive, error: np.ndarray, velocity: np.ndarray, torque: np.ndarray, free: tuple[str, ...]
 ) -> tuple[float, Drive]:
-    """Return the mean squared error and the drive of a local minimum near `start`, searched in the logarithms of the free
-    parameters.
+    """Search from `start` for a local minimum of the mean squared torque error; return that error and the drive. The search
+    changes the logarithms of the `free` parameters.
     """
     start = start if "viscous" in free else replace(start, viscous=0.0)
 

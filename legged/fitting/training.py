@@ -14,14 +14,14 @@ LEARNING_RATE = {"mlp": 3e-3, "lstm": 1e-2}
 BATCH = 4096
 """Batch size of an MLP."""
 CHUNK, BURN_IN, CHUNKS = 60, 15, 64
-"""LSTM: samples of a sequence, samples at its start without loss, and sequences of an update."""
+"""For an LSTM: samples in a sequence, samples at its start that the loss leaves out, and sequences in an update."""
 
 
 def train_network(
     log: ActuatorLog, kind: str, hidden: Sequence[int], samples: int, spacing: int, updates: int, seed: int
 ) -> NetworkWeights:
-    """Return a network (`mlp` or `lstm`) with `hidden` units per layer, trained on the samples of a log that are not held
-    out. An MLP reads the present sample and earlier ones, `samples` in all, `spacing` apart.
+    """Train a network (`kind`: `mlp` or `lstm`) with `hidden` units per layer on the samples of a log that are not held out.
+    Return its weights. An MLP reads `samples` samples: the present one, and earlier ones at intervals of `spacing` samples.
 
     Raises:
         ConfigError: the runs are too short.
@@ -39,7 +39,7 @@ def train_network(
         else:
             network, loss = _lstm(log, inputs, torque, hidden, random)
         optimiser = torch.optim.Adam(network.parameters(), LEARNING_RATE[kind])
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)  # decays to zero
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)  # the learning rate decays to 0
         for _ in range(updates):
             optimiser.zero_grad()
             loss().backward()
@@ -54,7 +54,7 @@ def train_network(
 
 
 def _weights(layer: nn.Module) -> dict[str, np.ndarray]:
-    """Return the weights of a layer by their names in `NetworkWeights`."""
+    """Return name -> array of a layer's weights, named as in `NetworkWeights`."""
     weights = {name: values.detach().numpy().astype(np.float32) for name, values in layer.named_parameters()}
     if isinstance(layer, nn.Linear):
         return weights
@@ -63,7 +63,7 @@ def _weights(layer: nn.Module) -> dict[str, np.ndarray]:
 
 
 def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
-    """Return the network's torques (T, D) for a log [N m], step by step as in a task, with a reset before each run."""
+    """Return the network's torques (T, D) [N m] for a log. The network runs step by step and is reset before each run."""
     joints = len(log.joint_names)
     network = ActuatorNetwork(weights, 1, joints, log.dt, torch.device("cpu"))
     error = torch.tensor(log.target - log.position, dtype=torch.float32)
@@ -79,7 +79,7 @@ def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
 
 
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the indices of training samples that directly follow at least `past` other training samples of their run."""
+    """Return the indices of training samples that directly follow `past` or more other training samples of their run."""
     usable = ~log.held_out
     starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
     since = np.arange(len(usable)) - np.maximum.accumulate(np.where(starts, np.arange(len(usable)), 0))
@@ -97,7 +97,7 @@ def _mlp(
     lags: np.ndarray,
     random: torch.Generator,
 ) -> tuple[nn.Module, Callable[[], Tensor]]:
-    """Return an MLP that sees errors and velocities `lags` samples ago, and its loss; arrays are (T, D), scaled."""
+    """Return an MLP and its loss. The MLP reads `seen` (scaled errors and velocities, (T, D)) from `lags` samples ago."""
     rows = _rows(log, int(lags[-1]))
     inputs = torch.tensor(np.stack([values[rows - lag].ravel() for values in seen for lag in lags], 1), dtype=torch.float32)
     outputs = torch.tensor(torque[rows].ravel(), dtype=torch.float32)
@@ -119,7 +119,7 @@ def _lstm(
     hidden: Sequence[int],
     random: torch.Generator,
 ) -> tuple[nn.Module, Callable[[], Tensor]]:
-    """Return an LSTM, and its loss by backpropagation through sequences; arrays are (T, D), scaled."""
+    """Return an LSTM and its loss on random sequences. The LSTM reads `seen` (scaled errors and velocities, (T, D))."""
     ends = torch.tensor(_rows(log, CHUNK - 1))
     inputs = torch.tensor(np.stack(seen, axis=2), dtype=torch.float32)
     outputs = torch.tensor(torque, dtype=torch.float32)

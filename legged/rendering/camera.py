@@ -1,4 +1,4 @@
-"""Cameras: rendering of one MuJoCo model off screen, viewpoints, pictures of tasks, and text in them."""
+"""Off-screen rendering of MuJoCo models: cameras and their viewpoints, pictures of tasks, and text in pictures."""
 
 import copy
 import functools
@@ -31,34 +31,34 @@ INK = (40, 40, 40)
 ON_A_PLANE = 130.0, -18.0
 """Azimuth and elevation of the camera on a plane [degrees]."""
 GLIDE, SMOOTH = 0.1, np.array([0.12, 0.12, 0.05])
-"""Share of the distance to the robot that the camera covers per picture: GLIDE on a plane, SMOOTH along x, y and z over
-terrain. Small shares keep steps from shaking the camera.
+"""For each picture, the point that the camera looks at moves towards the robot by this share of the distance: GLIDE on a
+plane, SMOOTH (x, y, z) on terrain. Small shares keep the robot's steps from shaking the picture.
 """
 CUT = 1.5
-"""Distance above which the camera over terrain jumps to the robot at once, because the robot was put elsewhere [m]."""
+"""If a robot on terrain is farther than this from the point that the camera looks at, the camera jumps to the robot [m]."""
 FLATTEST, STEEPEST = -22.0, -70.0
-"""Limits of the camera's elevation over terrain [degrees]."""
+"""Limits of the camera's elevation on terrain [degrees]."""
 BEHIND, FRONT = 62.0, 118.0
-"""Viewing directions over terrain, from the x axis [degrees]."""
+"""Azimuths of the camera at a robot's side on terrain: a little behind the robot, and a little in front of it [degrees]."""
 AHEAD, DROP = 3.0, 0.1
-"""A robot walks down if the ground at the distance AHEAD is lower by DROP [m]."""
+"""A robot is taken to walk down if the ground at a distance of AHEAD in front of it is lower by more than DROP [m]."""
 CLEAR = 0.35
 """Smallest height of the line of sight above the ground, except near the robot [m]."""
 COMMANDED = (0.10, 0.75, 0.25, 1.0)
 ACTUAL = (0.15, 0.45, 0.95, 1.0)
 SHADE = (0.05, 0.05, 0.05, 0.4)
 SPACING = 1.82
-"""Distance between neighbours on a plane, in lengths of a robot: 1.9 m for ANYmal C."""
+"""Distance between neighbouring robots in pictures of a plane, in lengths of a robot (1.9 m for ANYmal C)."""
 FOLLOWED_FROM = 3.45
-"""Distance of the camera from the robot that it follows over terrain, in lengths of a robot: 3.6 m for ANYmal C."""
+"""Distance of the camera from a robot on terrain, in lengths of a robot (3.6 m for ANYmal C)."""
 NEAR, FARTHER = 1.92, 1.05
 """The camera's distance on a plane is NEAR + FARTHER * sqrt(number of robots), in lengths of a robot."""
 ABOVE, APART = 0.335, 0.086
-"""Height of the lower arrow above the base, and of the upper arrow above the lower one, in lengths of a robot."""
+"""Height of the lower velocity arrow above the base, and of the upper arrow above the lower one, in lengths of a robot."""
 ARROW, SLOWEST_SHOWN = 0.6, 0.03
-"""Length of an arrow for 1 m/s [m]; slower robots have no arrow [m/s]."""
+"""Length of a velocity arrow for 1 m/s [m], and smallest velocity that is drawn as an arrow [m/s]."""
 SPOT, LIFTED = 0.086, 0.38
-"""Radius of the spot below a foot on the ground, and foot height at which the spot is smallest, in lengths of a robot."""
+"""Radius of the spot below a foot: SPOT * (1 - foot height / LIFTED), at least 0.3 SPOT; all in lengths of a robot."""
 ROOT, AWAY = 1, 2.4
 """A ModelCamera follows the body ROOT, the first one after the world, at a distance of AWAY lengths of the model."""
 DRAWN = 1000.0
@@ -95,7 +95,7 @@ class Camera:
         return self.renderer.render()
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
-        """Return the pixels (N, 2) of world points (N, 3) [m], from the upper left corner; valid after `update`."""
+        """Return the pixel coordinates (N, 2) of world points (N, 3) [m], from the upper left corner. Call `update` first."""
         eyes = self.renderer.scene.camera
         eye, forward, up = (np.mean([getattr(side, name) for side in eyes], axis=0) for name in ("pos", "forward", "up"))
         edge = eyes[0].frustum_top / eyes[0].frustum_near
@@ -104,7 +104,7 @@ class Camera:
         return 0.5 * np.array([self.width, self.height]) + 0.5 * self.height / edge * across / depth[:, None]
 
     def add_shape(self, kind: mujoco.mjtGeom, color: Sequence[float], size: Any, pos: Any) -> mujoco.MjvGeom:
-        """Add an upright shape of a size (3,) at `pos` (3,) [m], world frame, to the next picture only."""
+        """Add a shape of MuJoCo's `size` (3,) to the next picture only, at `pos` (3,), world frame [m]. Return the shape."""
         scene = self.renderer.scene
         geom, rgba = scene.geoms[scene.ngeom], np.array(color, dtype=np.float32)
         mujoco.mjv_initGeom(geom, kind, np.array(size, dtype=float), np.array(pos, dtype=float), np.eye(3).ravel(), rgba)
@@ -141,8 +141,8 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
 
 @functools.cache
 def window_opens() -> bool:
-    """Return whether GLFW can open windows. A display may accept connections and refuse windows; MuJoCo's viewer would then
-    wait for ever.
+    """Return whether GLFW can open windows. If it cannot, MuJoCo's viewer would wait for ever. A display that answers may
+    still refuse windows.
     """
     if HEADLESS:
         return False
@@ -154,7 +154,7 @@ def window_opens() -> bool:
         warnings.simplefilter("ignore")
         opens = bool(glfw.init())
     if opens:
-        glfw.terminate()  # the viewer initialises GLFW in its own thread
+        glfw.terminate()  # because the viewer initialises GLFW itself, in another thread
     return opens
 
 
@@ -162,14 +162,14 @@ def window_opens() -> bool:
 
 
 def size_of(robot: Robot) -> np.ndarray:
-    """Return the sides (3,) of the upright box around a robot in its default pose, with its visual and collision shapes [m].
-    ANYmal C's box is 1.04 m long and 0.77 m high.
+    """Return the sides (3,) [m] of the axis-aligned box around a robot in its default pose. The box contains all visual and
+    collision shapes; ANYmal C's box is 1.04 m long and 0.77 m high.
     """
     return size_of_model(robot_spec_of(robot.model_path, drawn=True).compile(), robot.default_qpos)
 
 
 def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
-    """Return the sides (3,) of the upright box around all bodies of a model except the world, at `qpos` (nq,) [m]."""
+    """Return the sides (3,) [m] of the axis-aligned box around all shapes, except the world's, of a model at `qpos` (nq,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -183,7 +183,7 @@ def size_of_model(model: mujoco.MjModel, qpos: np.ndarray) -> np.ndarray:
 
 
 def side_by_side(count: int, columns: int) -> np.ndarray:
-    """Return points (count, 3) of a horizontal grid of spacing 1 around the origin, row after row along -x."""
+    """Return points (count, 3) of a horizontal grid with spacing 1 around the origin; rows lie along y, columns along -x."""
     at = np.arange(count)
     grid = np.stack([-(at // columns), at % columns, 0 * at], axis=1).astype(float)
     return grid - grid.mean(axis=0)
@@ -199,17 +199,17 @@ def frame(
     points: np.ndarray, reach: Sequence[float], azimuth: float, elevation: float
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Return the nearest viewpoint from which all `points` (N, 3), world frame [m], are seen: the point (3,) in the middle of
-    the picture, the camera's distance from it [m], and the extent (2,) of the points across and up in the picture.
+    the picture, the camera's distance from that point [m], and the width and height (2,) of the points in the picture.
 
-    `reach` holds two tangents: those of the angles from the middle of the picture to the right end and to the upper end of
-    the area that the points fill. The returned extent has the same unit.
+    Lengths in the picture are tangents of viewing angles. `reach` (2,) is the largest allowed distance of a point from the
+    middle of the picture, horizontally and vertically.
     """
     forward = direction(azimuth, elevation)
     right = np.array([np.sin(np.radians(azimuth)), -np.cos(np.radians(azimuth)), 0.0])
     axes = np.stack([right, np.cross(right, forward)])
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     depth, aside = (points - middle) @ forward, (points - middle) @ axes.T
-    # A point at `aside` is in the picture if |aside - shift| <= reach * (distance + depth) along both axes.
+    # A point at `aside` is within `reach` if |aside - shift| <= reach * (distance + depth) along both axes.
     high, low = ((sign * aside / reach - depth[:, None]).max(axis=0) for sign in (1.0, -1.0))
     distance = float(0.5 * (high + low).max())
     shift = 0.5 * np.asarray(reach) * (high - low)
@@ -218,9 +218,9 @@ def frame(
 
 
 class Follower:
-    """The viewpoint of a camera at the side of a robot. Over terrain the camera is behind robots that walk up and in front of
-    robots that walk down, so that the faces of steps are visible. The camera looks down steeply enough to see into a pit.
-    Robots are assumed to walk along x.
+    """Controls a camera at the side of a robot. On terrain the camera is behind robots that walk up and in front of robots
+    that walk down, so that the faces of steps are visible. It looks down so steeply that no ground hides the robot. Robots
+    are assumed to walk along x.
     """
 
     def __init__(self, view: mujoco.MjvCamera, distance: float, ground: HeightMap | None) -> None:
@@ -232,7 +232,7 @@ class Follower:
         view.distance, (view.azimuth, view.elevation) = distance, ON_A_PLANE
 
     def update(self, target: np.ndarray) -> None:
-        """Move towards `target` (3,), world frame [m]; called once per picture."""
+        """Move the middle of the picture towards `target` (3,), world frame [m]; called once per picture."""
         way = target - self.view.lookat
         if not self.begun or (self.ground is not None and np.linalg.norm(way) > CUT):
             self.begun = True
@@ -260,9 +260,9 @@ class Follower:
 
 
 class RobotsCamera(Camera):
-    """A camera for `count` robots of a task, the first ones unless `turn_to` selects others. On a plane the robots stand side
-    by side, and the camera follows their middle. On terrain the camera follows one of them, number `followed`. Arrows show
-    the commanded and the actual velocity.
+    """A camera for `count` robots of a task: the first ones, or those that `turn_to` selects. On a plane the robots are drawn
+    side by side, and the camera follows their middle. On terrain it follows robot number `followed` of them. Arrows show the
+    commanded and the actual velocity.
     """
 
     def __init__(self, task: LeggedRobot, count: int, width: int = 960, height: int = 540) -> None:
@@ -275,12 +275,12 @@ class RobotsCamera(Camera):
         self.task, self.count = task, count
         self.first, self.followed = 0, 0
         self.sides = size_of(task.robot)
-        """(3,) box around a robot in its default pose [m]."""
+        """(3,) sides of the box around a robot in its default pose [m]."""
         self.length = length = float(self.sides.max())
         self.centre = np.array([0.0, 0.0, 0.5 * self.sides[2]])
         """(3,) point in the middle of a picture on a plane, relative to the ground below the middle of the robots [m]."""
         self.arrows = True
-        """True if velocities are drawn."""
+        """True if the arrows of the velocities are drawn."""
         self.ground = None if task.terrain is None else task.terrain.height_map
         if self.ground is None:
             self.offsets = SPACING * length * side_by_side(count, int(np.ceil(count**0.5)))
@@ -291,8 +291,8 @@ class RobotsCamera(Camera):
         self._single = mujoco.MjData(task.physics.model)
 
     def come_near(self, fill: float, glide: float) -> None:
-        """Move so close that the box around a robot in its default pose fills the share `fill` of the picture's width or
-        height. From then on the camera covers the share `glide` of the distance to the robot per picture.
+        """Move the camera so close that the box around a robot in its default pose fills the share `fill` of the picture's
+        width or height. From then on the camera moves by the share `glide` of its distance to the robot per picture.
         """
         up = fill * np.tan(np.radians(0.5 * self.model.vis.global_.fovy))
         corners = 0.5 * self.sides * np.array(list(product((-1.0, 1.0), repeat=3)))
@@ -340,7 +340,6 @@ class RobotsCamera(Camera):
             self.add_shape(mujoco.mjtGeom.mjGEOM_ELLIPSOID, SHADE, [radius, radius, 0.02], [*foot[:2], height])
 
     def _arrow(self, start: np.ndarray, velocity: np.ndarray, color: tuple[float, ...]) -> None:
-        """Draw a velocity (2,) [m/s] as an arrow."""
         if np.linalg.norm(velocity) < SLOWEST_SHOWN:
             return
         kind, end = mujoco.mjtGeom.mjGEOM_ARROW, start + ARROW * np.array([*velocity, 0.0])
@@ -361,7 +360,7 @@ class ModelCamera(Camera):
         follow_root(self.view, self.model)
 
     def turn_to(self, followed: int) -> None:
-        """Draw the environment `followed`."""
+        """Show the environment number `followed` in the next pictures."""
         self.followed = followed
 
     def picture(self, lines: Sequence[str] = ()) -> np.ndarray:
@@ -372,10 +371,10 @@ class ModelCamera(Camera):
 
 
 def drawn_model(task: BaseTask, width: int, height: int) -> mujoco.MjModel:
-    """Return a copy of a task's model for pictures of that size [pixels], with few effects and wide ground planes."""
+    """Return a copy of a task's model for pictures of `width` x `height` [pixels], without shadows and with wide planes."""
     model = copy.deepcopy(task.physics.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # speeds rendering without a GPU up tenfold
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # makes rendering without a GPU ten times faster
     # Planes are infinite in the simulation. They are drawn as large finite ones, with textures of the same scale, because
     # MuJoCo shifts an infinite plane with the camera: two pictures of the same state would differ.
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
@@ -395,7 +394,7 @@ def follow_root(view: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
 
 
 def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 540) -> ModelCamera | RobotsCamera:
-    """Return a camera for a task, with pictures of that size [pixels]. In a task of legged robots it draws the first `count`.
+    """Return a camera for pictures of `width` x `height` [pixels]. In a `LeggedRobot` task it draws the first `count` robots.
 
     Raises:
         RunError: this machine cannot render.
@@ -409,8 +408,8 @@ def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 54
 
 
 def caption(picture: np.ndarray, lines: Sequence[str], colors: Sequence[Sequence[float]] = ()) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner. The first lines are written
-    in slightly darker versions of `colors` (red, green, blue, 0 to 1).
+    """Return a picture (height, width, 3) uint8 with lines of text in its upper left corner. Line i has a darker version of
+    the colour `colors[i]` (red, green, blue, 0 to 1). Further lines are dark grey.
     """
     if not lines:
         return picture

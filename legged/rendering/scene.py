@@ -1,6 +1,6 @@
 """Scenes that are drawn and not simulated: robots on a floor or a terrain, under a sky.
 
-Terrain is coloured by its height, so that steps show without shadows.
+Terrain is coloured by its height, so that steps are visible without shadows.
 """
 
 import mujoco
@@ -15,16 +15,16 @@ from legged.terrain import Terrain
 SHOWN_DEPTH = 0.6
 """Thickness of the drawn ground below the lowest point [m]."""
 LOW, MIDDLE, HIGH = np.array([[0.42, 0.52, 0.58], [0.80, 0.77, 0.70], [0.78, 0.58, 0.42]])
-"""Colours of the deepest, the level and the highest ground."""
+"""Colours of the lowest ground, of ground at height 0, and of the highest ground."""
 FAR = 100.0
-"""Smallest extent of the level ground from the middle of a terrain [m]; for large terrain, 1.2 times half its side."""
+"""Smallest distance from the middle of a terrain to the end of the level ground around it [m]."""
 CHECKER = 0.94, 1.0
-"""Brightness of dark and of light squares."""
+"""Brightness of the dark and of the light squares of checkered ground."""
 SQUARE = 0.5
-"""Side of a square [m]."""
+"""Side of a square of checkered ground [m]."""
 GROUND = "terrain_checker"
 LEVEL_RANGE = 0.9
-"""Colours change between this height below and above 0. Checkered terrain extends this range to its largest height [m]."""
+"""Colours change between minus and plus this height [m]. On checkered terrain the range includes all heights."""
 
 
 def add_sky(scene: mujoco.MjSpec) -> None:
@@ -41,11 +41,11 @@ def add_sky(scene: mujoco.MjSpec) -> None:
 
 
 def display_model(robot: Robot, count: int, width: int, height: int, terrain: Terrain | None = None) -> mujoco.MjModel:
-    """Return a model of `count` copies of a robot over a checkered floor or a terrain, for pictures of that size [pixels]."""
+    """Return a model of `count` robots on a checkered plane or `terrain`, for pictures of `width` x `height` [pixels]."""
     scene = mujoco.MjSpec()
     look = scene.visual
     look.global_.offwidth, look.global_.offheight = width, height
-    look.quality.shadowsize = look.quality.offsamples = 0  # speeds rendering without a GPU up tenfold
+    look.quality.shadowsize = look.quality.offsamples = 0  # makes rendering without a GPU ten times faster
     look.map.zfar = 60
     scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
     add_sky(scene)
@@ -73,7 +73,7 @@ def add_robots(scene: mujoco.MjSpec, robot: Robot, count: int) -> None:
 
 
 def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[float], side: int) -> mujoco.MjsMaterial:
-    """Return a new material of squares of two colours. Its texture is `side` pixels wide."""
+    """Add a checkered material of two colours and return it. Its texture is `side` pixels wide and high."""
     kind, builtin = mujoco.mjtTexture.mjTEXTURE_2D, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     scene.add_texture(name=name, type=kind, builtin=builtin, rgb1=one, rgb2=other, width=side, height=side)
     material = scene.add_material(name=name, texuniform=True)
@@ -82,8 +82,8 @@ def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[f
 
 
 def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool = False) -> None:
-    """Add a terrain without collisions, coloured by height. With `checkered`, level ground and slopes have squares that show
-    the motion of a camera. Steps have none, because their squares would make rendering a third slower.
+    """Add a terrain without collisions, coloured by height. With `checkered`, level ground and slopes are checkered, so that
+    a camera's motion is visible. Steps are not, because this would make rendering a third slower.
     """
     span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
     if checkered:
@@ -96,7 +96,7 @@ def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool 
 
 
 def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
-    """Add level ground around a checkered terrain up to the horizon."""
+    """Add level ground from the edges of a checkered terrain to the horizon."""
     x, y = (0.5 * side for side in terrain.height_map.size)
     far = max(FAR, 1.2 * x, 1.2 * y)
     half = 0.5 * (far - x), 0.5 * (far - y)
@@ -110,8 +110,8 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
 
 
 def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
-    """Colour a geom by its heights between -`span` and `span` [m]: a box by one colour, a height field by a texture. Points
-    of a height field below the `lowest` ground [m] are hidden. With the edge `cell` of the terrain's cells [m], draw squares.
+    """Give a box one colour, or a height field a texture, by its height. Colours change from -`span` to `span` [m]. Points of
+    a height field below `lowest` [m] count as hidden. With `cell`, the side of a terrain cell [m], the ground is checkered.
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]
@@ -133,9 +133,9 @@ def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: floa
 
 
 def _spread(heights: np.ndarray, sunk: np.ndarray) -> np.ndarray:
-    """Return heights (X, Y) in which each `sunk` point has the mean height of its neighbours that are not sunk. If all
-    neighbours are sunk, it has the mean of all points that are not. Otherwise the colours of hidden points would show at the
-    edge of visible ones, because textures are blurred.
+    """Return heights (X, Y) in which each hidden point (`sunk`) has the mean height of its visible neighbours, or of all
+    visible points if it has no visible neighbour. This is needed because textures are blurred: colours of hidden points
+    affect the edges of visible ground.
     """
     if not sunk.any():
         return heights

@@ -27,20 +27,20 @@ AZIMUTH, ELEVATION = 14.0, -35.0
 FILLED = 0.96
 """Share of the picture that the terrain fills."""
 SUN = np.array([0.39, -0.54, -0.75])
-"""Direction of the light: from the left, so that risers that face the camera are lit, but less than treads."""
+"""Direction of the light. It comes from the left, so that the risers in view are lit, but less than the treads."""
 FIELD_OF_VIEW = 30.0
 """Vertical field of view of the camera [degrees]."""
 
 
 def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, seed: int) -> Terrain:
-    """Return a terrain of the given types (R, C), all equally difficult, with a narrow border."""
+    """Return a terrain with tiles of the types in `rows` (R, C), all of the same `difficulty`, and a narrow border."""
     specs = [[TileSpec(name, tile_size(cfg, name, difficulty)) for name in row] for row in rows]
     return Terrain.of_tiles(specs, replace(cfg, border_size=MARGIN), np.random.default_rng(seed))
 
 
 def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float) -> np.ndarray:
-    """Return a picture (height, width, 3) uint8 of one labelled tile per type, with a robot on each, row by row from the
-    upper left corner.
+    """Return a picture (height, width, 3) uint8 of one labelled tile for each terrain type. A robot stands on each tile. The
+    tiles run row by row from the upper left corner.
 
     Raises:
         RunError: this machine cannot render.
@@ -48,7 +48,7 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
     count = len(types)
     columns = count if count <= 3 else -(-count // 2) if count <= 8 else 4
     rows = -(-count // columns)
-    # The camera looks along x. So the first types, in the upper left corner, have the largest row and column.
+    # The camera looks along x, so the tile with the largest row and column numbers is in the picture's upper left corner.
     places = {(rows - 1 - i // columns, columns - 1 - i % columns): name for i, name in enumerate(types)}
     names = [[places.get((r, c), "flat") for c in range(columns)] for r in range(rows)]
     terrain, robot = tiles(cfg.terrain, names, difficulty, cfg.env.seed), load_robot(cfg.robot)
@@ -72,7 +72,7 @@ def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float)
 
 
 def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.MjModel:
-    """Return the scene of a terrain and copies of a robot, for pictures of that height [pixels]."""
+    """Return a model of a terrain and `count` copies of a robot, for pictures of WIDTH x `height` [pixels]."""
     scene = mujoco.MjSpec()
     add_sky(scene)
     look = scene.visual
@@ -83,7 +83,7 @@ def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.Mj
     scene.stat.extent, scene.stat.center = extent, [0, 0, 0]
     look.map.znear, look.map.zfar, look.map.shadowclip = 0.2, 6.0, 1.2
     scene.worldbody.add_light(
-        pos=-2.0 * extent * SUN,  # shadows are cast only within znear and zfar from here
+        pos=-2.0 * extent * SUN,  # only things between the distances znear and zfar from here cast shadows
         dir=SUN,
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         diffuse=[0.62] * 3,
@@ -108,7 +108,7 @@ def _pose(model: mujoco.MjModel, data: mujoco.MjData, origins: np.ndarray, robot
 
 
 def _label_at(terrain: Terrain, row: int, col: int) -> np.ndarray:
-    """Return the position (3,) of a tile's label: behind the farthest tiles, and on the near edge of the others [m]."""
+    """Return the position (3,) of a tile's label [m]: behind a tile of the farthest row, at the near edge of other tiles."""
     x, y, _ = terrain.origins[row, col]
     if row == len(terrain.origins) - 1 > 0:
         return np.array([x + 0.5 * (terrain.tile_size[0] + terrain.border), y, 0.0])
@@ -117,7 +117,7 @@ def _label_at(terrain: Terrain, row: int, col: int) -> np.ndarray:
 
 
 def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
-    """Write a map of the heights to `path`, with the edges, types, `levels` (R,) and origins of the tiles."""
+    """Write a map of a terrain's heights and tiles to `path`; `levels` (R,) are texts with the difficulties of tile rows."""
     import_matplotlib()
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -131,7 +131,7 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     # On the map, x points upward and y to the left. The light comes from the upper left.
     heights = ground.heights[shown][::-1, ::-1]
     largest = max(float(np.abs(heights).max()), 0.05)
-    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps show next to high ones.
+    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps are visible next to high ones.
     scale, colors = AsinhNorm(linear_width=0.25, vmin=-largest, vmax=largest), colormaps["RdYlBu_r"]
     light = LightSource(azdeg=315, altdeg=45)
     shaded = light.shade(heights, colors, blend_mode="soft", norm=scale, vert_exag=2.0, dx=ground.cell, dy=ground.cell)

@@ -145,7 +145,7 @@ def test_a_log_is_resampled_without_looking_ahead(tmp_path):
     assert len(half.run) == 1067  # 3.9975 s of 3.75 ms
     assert half.target[1, 0] == log.target[1, 0]  # at 3.75 ms the target of 2.5 ms
     assert half.position[1, 0] == pytest.approx(0.5 * (log.position[1, 0] + log.position[2, 0]))
-    with pytest.raises(ConfigError, match=r"--dt: the log was sampled every 0.0025 s"):
+    with pytest.raises(ConfigError, match=r"--dt: must be at least 0.0025 s"):
         log.resampled(0.001)
 
 
@@ -296,7 +296,7 @@ def test_joints_with_drives_of_their_own_are_not_fitted_as_one(tmp_path, changes
     [
         (["--joints", "knee"], "--joints: pattern 'knee' matches nothing"),
         (["--spacing", "0.007"], "--spacing: must be a whole multiple of --dt"),
-        (["--dt", "0.001"], "--dt: the log was sampled every 0.0025 s"),
+        (["--dt", "0.001"], "--dt: must be at least 0.0025 s (the time step of the log)"),
         (["--hidden", "8,0"], "--hidden: must be 1 to 1024, got 0"),
         (["--hidden", "8 8"], "--hidden: expected numbers like 32,32,32, got '8 8'"),
     ],

@@ -103,7 +103,7 @@ def test_an_evaluation_of_another_checkpoint_than_the_last_is_called_that(capsys
     assert table.main([]) == 0
     assert [row["evaluated"] for row in table_in()] == [last, ""]
     assert report.main([*map(str, folders)]) == 0
-    said = f"In C MuJoCo it is of `{last}`, which is not the last policy."
+    said = f"In C MuJoCo the evaluation is of `{last}`, which is not the last policy."
     assert [said in (folder / "report.md").read_text() for folder in folders] == [True, False]
     assert compare.main([*map(str, folders)]) == 0
     text = Path("logs/comparison.md").read_text().replace("\\", "")

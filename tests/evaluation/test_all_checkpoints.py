@@ -61,7 +61,7 @@ def test_the_file_says_under_what_conditions_checkpoints_were_judged_and_lost_co
     assert result["changes"] == {"sim.iterations": 30}
     assert (result["grid"], result["robots_per_cell"]) == ({"vx": [0.5], "vy": [0.0], "yaw": [0.0]}, 1)
     assert result["contact_overflows"] == 3
-    assert "warning: tracking: contacts were lost for want of memory, 3 times" in capsys.readouterr().err
+    assert "warning: tracking: contacts were lost 3 times (robots x steps)" in capsys.readouterr().err
 
 
 def test_a_robot_that_always_falls_does_not_walk():

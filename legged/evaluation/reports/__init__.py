@@ -15,7 +15,7 @@ def _templates() -> "Environment":
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a page or a drawing from a template in the folder templates/; texts are escaped. A page holds its style and its
-    script, and its content security policy lets it load nothing else.
+    """Return a page or a drawing from a template in the folder templates/; texts are escaped. A page contains its style and
+    its script. Its content security policy forbids the browser to load anything else.
     """
     return _templates().get_template(template).render(values)

@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0
 """Margins around the axes [SVG units]."""
 MOST_POINTS = 240
-"""Largest number of points of a line; a longer line is averaged, because a drawing has hardly more pixels."""
+"""Largest number of points of a line. Points of longer lines are averaged, because a drawing has hardly more pixels."""
 LETTER = 6.3
 """Mean width of a letter of the legend [SVG units]."""
 INK, QUIET, GRID, REST = "#1b1f24", "#57606a", "#e1e5e9", "#9aa4ae"
@@ -54,7 +54,7 @@ class Chart:
     x_label: str
     lines: Sequence[Line] = ()
     unit: str = "iteration"
-    """Name of the quantity x, shown with a value of x."""
+    """Name of the quantity x, which the page's script shows next to a value of x."""
     log: bool = False
     percent: bool = False
     """True: y is a share, and its axis ends at 100 %."""
@@ -64,8 +64,8 @@ class Chart:
     """Names and x of dotted vertical lines."""
 
     def cleaned(self) -> "Chart":
-        """Return the chart without the values that can't be drawn, which are not finite, or not positive on a log axis. Its
-        lines have at most MOST_POINTS points, and each has a style.
+        """Return the chart without values that can't be drawn: those that are not finite or, on a log axis, not positive.
+        Each line gets a style, and lines without markers are reduced to MOST_POINTS points.
         """
         lines = []
         for i, line in enumerate(self.lines):
@@ -81,7 +81,7 @@ class Chart:
 
 
 def draw_charts(charts: Sequence[Chart], path: Path, title: str = "", iteration_s: float | None = None) -> None:
-    """Draw charts as panels of one PNG file, two in a row. With `iteration_s`, the length of an iteration [s], panels have a
+    """Draw charts as panels of one PNG file, two in a row. With `iteration_s`, the time of an iteration [s], panels have a
     second x axis in seconds.
 
     Raises:
@@ -131,7 +131,7 @@ def draw_panel(axis: Any, chart: Chart) -> None:
         axis.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if not chart.log:
         low, high = _y_range(chart)
-        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # so that markers at 100 % are not cut off
+        axis.set_ylim(low, 1.04 * high if chart.percent else high)  # leave room for markers at 100 %
     axis.grid(alpha=0.3)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -157,7 +157,7 @@ def curves(chart: Chart) -> str:
 
 
 def stacked(chart: Chart, x: np.ndarray, parts: dict[str, np.ndarray]) -> str:
-    """Return an SVG of `parts` (n,) over x (n,) as stacked areas, with negative values below 0, and their sum as a line."""
+    """Return an SVG of `parts` (n,) over x (n,) as stacked areas, with a line for their sum. Negative values lie below 0."""
     x, *values = _thinned(x, *parts.values())
     ups, downs = (np.cumsum([np.zeros(len(x)), *(of(v, 0.0) for v in values)], axis=0) for of in (np.maximum, np.minimum))
     sums = replace(chart, lines=[Line("", x, edge) for edge in (ups[-1], downs[-1])])
@@ -197,7 +197,7 @@ def shade(share: float) -> str:
 
 
 def sheet(drawings: Sequence[str], columns: int = 2) -> str:
-    """Return one SVG with all drawings, `columns` side by side."""
+    """Return one SVG with all drawings, `columns` of them in a row."""
     sizes = [tuple(map(float, re.findall(r'viewBox="0 0 (\S+) (\S+)"', one)[0])) for one in drawings]
     top, body = 0.0, []
     for start in range(0, len(drawings), columns):
@@ -247,12 +247,10 @@ class _Frame:
         return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(self.px(x), self.py(y), strict=True))
 
     def area(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, opacity: float, edged: bool = False) -> None:
-        """Fill the area between two lines."""
         points = f"{self._points(x, low)} {self._points(x[::-1], high[::-1])}"
         self.marks.append({"kind": "area", "points": points, "color": color, "opacity": opacity, "edged": edged})
 
     def line(self, line: Line, color: str, dash: str) -> None:
-        """Draw a line through its points."""
         dots = zip(self.px(line.x), self.py(line.y), strict=True) if line.markers else ()
         look = {"points": self._points(line.x, line.y), "dash": dash, "dots": dots}
         self.marks.append({"kind": "line", **look, **self.data(line, color)})
@@ -294,7 +292,6 @@ def _thinned(*columns: np.ndarray) -> list[np.ndarray]:
 
 
 def _y_range(chart: Chart) -> tuple[float, float]:
-    """Return the range of the y axis of a chart."""
     level = [] if chart.level is None else [[chart.level[1]]]
     values = np.concatenate([*level, [], *(part for line in chart.lines for part in (line.y, *(line.band or ())))])
     values = values[np.isfinite(values)]

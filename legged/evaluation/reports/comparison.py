@@ -1,5 +1,5 @@
-"""Comparisons: evaluations in tables for the screen, and runs on a page with settings, curves and evaluations. On the screen,
-evaluations of the same task in the same engine under the same conditions count as its seeds.
+"""Comparisons of evaluations, in tables for the screen, and of runs, on a page with settings, curves and evaluations. In the
+tables, evaluations of one task in one engine under the same conditions count as those of different seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +53,7 @@ Measured = tuple[float, Interval | None] | None
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
-    """Keep only the terrain types `types` in the results, in that order.
+    """Remove all terrain types but `types` from the results, in place, and put the kept ones in the order of `types`.
 
     Raises:
         ConfigError: one of the types is in no result.
@@ -69,8 +69,8 @@ def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
 
 
 def grouped(results: Sequence[dict[str, Any]]) -> Evaluations:
-    """Return the results in groups of the same task, engine, changed fields and grid of commands, in the order of the first
-    result of each group.
+    """Return the results in groups of the same task, engine, changed fields and grid of commands. The groups are in the order
+    of their first results.
     """
     groups: Evaluations = {}
     for result, differing in zip(results, conditions_of(results), strict=True):
@@ -126,14 +126,13 @@ def _heads(groups: Evaluations) -> list[str]:
 
 
 def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
-    """Return a mean as text. Brackets hold the spread of several values and, if seeds lack a value, how many have one."""
+    """Return the mean of `values` as text. Brackets hold `spread_text`, and the number of values if seeds lack a value."""
     notes = [spread_text] if len(values) > 1 else []
     notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
     return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
 
 
 def _range_text(values: Sequence[float], seeds: int, form: str, range_form: str) -> str:
-    """Return a mean and the range of the values as text; an empty text without values."""
     return _mean_text(values, seeds, form, f"{min(values):{range_form}} to {max(values):{range_form}}") if values else ""
 
 
@@ -158,7 +157,7 @@ def heading(key: Key, seeds: int) -> str:
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> success of each seed that was measured on `terrain`, for the sizes that these seeds share."""
+    """Return size -> share of successful robots for each seed measured on `terrain`, for sizes that all these seeds have."""
     entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
@@ -166,7 +165,7 @@ def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[
 
 
 def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
-    """Return terrain type -> the entry of one of the results, for all types that were measured."""
+    """Return terrain type -> its entry in the last result that has the type, for all types in the results."""
     entries = [types_in(result) for results in groups.values() for result in results]
     return {name: entry for one in entries for name, entry in one.items()}
 
@@ -185,8 +184,8 @@ def success_table(groups: Evaluations) -> ScreenTable:
 
 
 def draw_comparison(groups: Evaluations, path: Path) -> None:
-    """Draw success into a PNG file: a panel for each terrain type, a line for each group, with a band from the worst to the
-    best seed.
+    """Draw success over size into a PNG file, with a panel for each terrain type. A panel has a line for each group, with a
+    band from the group's worst to its best seed.
     """
     charts = []
     for name in types_of(groups):
@@ -228,7 +227,7 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
 
 
 def apart(names: Sequence[str]) -> tuple[str, list[str]]:
-    """Return the common parts of runs' labels, and the rest of each label; no common parts if a rest would be empty."""
+    """Split labels into their common parts and the rest of each label. If a rest is empty, labels are not split."""
     parts = [name.split(", ") for name in names]
     common = [part for part in parts[0] if all(part in one for one in parts)]
     rest = [", ".join(part for part in one if part not in common) for one in parts]
@@ -236,7 +235,7 @@ def apart(names: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
-    """Return tables and drawings of the engines in which at least two runs were evaluated."""
+    """Return tables and drawings of the evaluations in each engine in which at least two runs were evaluated."""
     parts: list[Part] = []
     for engine in by_engine(result for record in records for result in record.results.values()):
         results = [record.results.get(engine) for record in records]
@@ -244,7 +243,7 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
             continue
         parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
-        parts += [Paragraph(f"{name}: of `{file}`, which is not its last policy.") for name, file in others if file]
+        parts += [Paragraph(f"{name}: evaluated is `{file}`, which is not its last policy.") for name, file in others if file]
         for name, (changed, grid) in zip(names, conditions_of(results), strict=True):
             told = "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if grid else [])])
             parts += [Paragraph(f"{name}: {told}.")] if told else []
@@ -324,7 +323,7 @@ def _difference(first: Counted, second: Counted) -> Measured:
 
 
 def _errors(name: str, result: dict[str, Any]) -> Counted:
-    """Return command -> error; the mean error if the file lacks the cells."""
+    """Return command -> error, or the mean error if the result has no cells."""
     tracking = tracking_of(result)
     try:
         cells = {tuple(cell["command"]): float(cell[name]) for cell in tracking["cells"] if cell[name] is not None}
@@ -339,8 +338,8 @@ def _failures(result: dict[str, Any]) -> Counted:
 
 
 def _returns(result: dict[str, Any]) -> Counted:
-    """Return mean and sample standard deviation of returns, and the number of episodes. The sample standard deviation is
-    computed from the population's, which the file holds.
+    """Return the mean and the sample standard deviation of returns, and the number of episodes. The sample standard deviation
+    is computed from the population standard deviation in the file.
     """
     count = int(value_at(result, "episodes.count") or 0)
     if count < 1:

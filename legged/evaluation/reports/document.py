@@ -13,7 +13,7 @@ from legged.process.paths import write_text
 from legged.tables import markdown_table
 
 SHORT = 32
-"""Number of letters of a cell that are kept on one line."""
+"""A cell with at most this many letters is kept on one line."""
 KINDS = {".gif": "image/gif", ".png": "image/png", ".jpg": "image/jpeg", ".webp": "image/webp", ".mp4": "video/mp4"}
 
 
@@ -62,12 +62,12 @@ class Table(NamedTuple):
 
     @property
     def numeric(self) -> list[bool]:
-        """Flags of the columns that hold numbers only."""
+        """A flag for each column: True if it has rows and all its cells are numbers."""
         return [bool(self.rows) and all(isinstance(row[i], Number) for row in self.rows) for i in range(len(self.head))]
 
 
 class Figures(NamedTuple):
-    """Drawings (SVG), side by side where there is room; for Markdown they are one file called `name`."""
+    """Drawings (SVG), side by side where there is room. For Markdown they are one file, whose name ends in _<name>.svg."""
 
     name: str
     drawings: Sequence[str]
@@ -92,7 +92,7 @@ class Picture(NamedTuple):
 
 
 class Listing(NamedTuple):
-    """Lines of a program or a diff. They are folded up in HTML; Markdown names their `file` instead."""
+    """Lines of a program or a diff. HTML shows them after a click; Markdown has a link to `file` instead."""
 
     title: str
     text: str
@@ -103,7 +103,7 @@ Part = Heading | Paragraph | Table | Figures | Picture | Listing
 
 
 def number(value: float | None, form: str = ".3f") -> Number:
-    """Return a number as a cell; a dash, which is sorted last, for None and for values that are not finite."""
+    """Return a number as a cell. None and values that are not finite become a dash, which is sorted last."""
     return Number("-", None) if value is None or not math.isfinite(value) else Number(f"{value:{form}}", value)
 
 

@@ -19,12 +19,12 @@ EMPTY = ("", "-")
 """Texts of empty cells. A column with only empty cells is left out."""
 STAIRS = ("stairs_up", "stairs_down")
 PASSED = 0.9
-"""Least share of robots that have to cross stairs for the stairs to count as crossed."""
+"""Stairs count as crossed if at least this share of the robots crosses them."""
 
 
 def experiments_parts(records: Sequence[Record], beside: Path, ending: str, seeds_share: bool = False) -> list[Part]:
-    """Return the parts of a page on some runs, which will be written to the folder `beside`. Runs in that folder are linked
-    to their reports, report.<ending>. With `seeds_share`, runs that differ only in their seed share a row, with means.
+    """Return the parts of a page that lists runs. The page will be written to the folder `beside`; runs in this folder get
+    links to their reports, report.<ending>. With `seeds_share`, runs that differ only in their seeds share a row of means.
     """
     newest = sorted(records, key=lambda record: (record.began, record.name), reverse=True)
     groups: dict[str, list[Record]] = {}
@@ -64,7 +64,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return column -> cell for a run. Evaluated figures are those in the first engine of ENGINES with an evaluation."""
+    """Return column -> cell for a run. Evaluated figures are from the first engine of ENGINES in which it was evaluated."""
     timing = record.timing
     judged = next(iter(record.results.values()), {})
     return {
@@ -83,8 +83,8 @@ def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
 
 
 def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | None, str]]:
-    """Return column -> figure and its format, for the figures that are averaged over seeds: those of the evaluation `judged`,
-    those at the end of the training, and the training's times.
+    """Return column -> (figure, number format), for the figures that are averaged over seeds: those of the evaluation
+    `judged`, those at the end of the training, and the training's times.
     """
     timing, tracking = record.timing, tracking_of(judged)
     return {
@@ -104,8 +104,8 @@ def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | 
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest steps [m] such that robots crossed these and all lower steps, both up and down.
-    Return 0 if robots did not cross the lowest steps, and None without evaluations in both directions.
+    """Return the height of the highest stair steps [m] such that the robots crossed these and all lower ones, up and down.
+    Return 0 if they did not cross the lowest steps, and None without evaluations in both directions.
     """
     points = [types_in(result).get(name, {}).get("points", []) for name in STAIRS]
     ways = [{point["size"]: point["share"] for point in of_type} for of_type in points]

@@ -31,7 +31,7 @@ MOST_WORDS = 4
 """Largest number of settings that a summary names."""
 LONGEST_VALUE = 60
 DEEPEST = 3
-"""Number of levels of folders that are searched for runs: logs, tasks, runs."""
+"""Number of levels of folders that are searched for runs: logs/, logs/<task>/ and logs/<task>/<run>/."""
 QUIET_S = 3600.0
 """Time without new output after which a training counts as ended, even if a process with its id exists [s]."""
 QUIET_ELSEWHERE_S = 120.0
@@ -40,7 +40,7 @@ QUIET_ELSEWHERE_S = 120.0
 
 @dataclass(frozen=True)
 class Code:
-    """The state of the code that a run was made with."""
+    """The code that made a run: version, commit and uncommitted changes."""
 
     version: str = ""
     commit: str = ""
@@ -67,7 +67,7 @@ class Record:
 
     folder: Path
     config: dict[str, Any]
-    """The resolved configuration, with the field names of this version if this version can read the file."""
+    """The complete configuration. Its fields have the names of this version, unless this version cannot read the file."""
     began: datetime
     timing: Timing | None
     scalars: Scalars
@@ -75,13 +75,13 @@ class Record:
     """Name of an engine -> the run's evaluation in it, in the order of ENGINES."""
     code: Code
     note: str
-    """Note of the user."""
+    """The user's note on the run (`--note`)."""
     status: str
-    """finished, running, interrupted, crashed or killed."""
+    """One of finished, running, interrupted, crashed and killed."""
     why: str
     """Details of the status."""
     done: int
-    """Number of iterations at the last checkpoint or log entry, including iterations before a resumption."""
+    """Number of iterations up to the last checkpoint or log entry, with those before the run was resumed."""
     problems: tuple[str, ...]
     """Reasons why parts could not be read."""
     given: Invocation | None = None
@@ -124,15 +124,13 @@ class Record:
         return Log(self.scalars, self.config)
 
     def another_policy(self, result: dict[str, Any] | None) -> str:
-        """Return the name of the evaluated checkpoint; an empty text if it is the run's last checkpoint, which all other
-        figures describe.
-        """
+        """Return the name of the checkpoint that `result` evaluates, or an empty text if it is the run's last checkpoint."""
         checkpoint = (result or {}).get("checkpoint")
         return str(checkpoint) if of_another_policy(self.folder, checkpoint) else ""
 
 
 def folders_in(path: Path) -> list[Path]:
-    """Return the run folders in a folder: the folder itself, or those in logs/ or logs/<task>/.
+    """Return the run folders at or below `path`, at most two levels deep: `path` may be a run folder, logs/<task>/ or logs/.
 
     Raises:
         ConfigError: there is no run folder.
@@ -185,14 +183,14 @@ def _began(folder: Path) -> datetime:
 
 
 def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: int) -> tuple[str, str]:
-    """Return the status of a run, and the details of the status."""
+    """Return `status` and `why` of a record."""
     of = f"{done:,} of {until:,} iterations" if isinstance(until, int) else f"{done:,} iterations"
     if timing is not None:
         if timing.finished:
             return "finished", of
         if timing.error:
             return "crashed", f"after {of}: {timing.error}"
-        return "interrupted", f"after {of}, by a signal, by its sweep, or because its output went away"
+        return "interrupted", f"after {of}, by a signal, by its sweep, or because its output was closed"
     if (folder / "model.pt").is_file():
         return "finished", "a policy that comes with this package"
     if isinstance(until, int) and saved >= until:
@@ -203,8 +201,8 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
 
 
 def is_running(folder: Path) -> bool:
-    """Return whether the process that writes a run's log is alive. On this machine the process is looked up by its id in the
-    log's name (events.out.tfevents.<time>.<host>.<process>.<file>); for another machine the log's last change counts.
+    """Return whether the process that writes a run's log is alive. On this machine it is looked up by its id, which is in the
+    log's name (events.out.tfevents.<time>.<host>.<process>.<file>). On another machine the log must have changed recently.
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
@@ -220,7 +218,7 @@ def is_running(folder: Path) -> bool:
 
 
 def read_code(folder: Path) -> Code:
-    """Read the version, the commit and the uncommitted changes that a run was made with."""
+    """Read the version, the commit and the uncommitted changes of the code that made a run."""
     try:
         text = (folder / CODE_FILE).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -244,8 +242,8 @@ def read_note(folder: Path) -> str:
 
 
 def from_task_file(record: Record) -> dict[str, list[Any]] | None:
-    """Return setting -> the run's value and the value in the task's files, for settings that differ; None if there is no such
-    task. If the run's device is not known, the task's settings for CPU or for GPU are taken, whichever differ less.
+    """Return setting -> [the run's value, the value in the task's files], for settings that differ; None if there is no such
+    task. If the run's device is not known, the task's settings for CPU or for GPU are used, whichever differ less.
     """
     where = [record.timing.device == "cpu"] if record.timing else [False, True]
     try:
@@ -281,7 +279,7 @@ def what_changed(record: Record, named: bool = True) -> str:
 
 
 def but_for_seeds(record: Record) -> str:
-    """Return a text that is equal for runs which differ in nothing but their seed and names."""
+    """Return a text that is the same for two runs if they differ only in their seeds and names."""
     told = {path: value for path, value in flat(record.config).items() if path not in (*NAMES[:-1], "env.seed")}
     device = record.timing.device if record.timing else ""
     return repr((sorted(told.items()), record.note, record.status, record.done, record.code.summary, device))

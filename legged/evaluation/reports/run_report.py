@@ -45,9 +45,9 @@ from legged.process.processes import child_environment
 REPORT = "report"
 """Name of the report's files, before their ending."""
 ROWS = 10
-"""Number of rows of the table over the training."""
+"""Number of rows of the table that shows figures over the training."""
 LARGEST_FILM = 12 * 2**20
-"""Largest film that is shown in the report; of a larger film the report gives the name [bytes]."""
+"""Size of the largest film that the report shows [bytes]. Of a larger film it gives only the file name."""
 LOG = "film.log"
 """Name of the file in a run folder with the output of the process that films the policy."""
 NICENESS = 10
@@ -71,7 +71,7 @@ OVER_TRAINING = {
     "Metrics/episode_length": ("episode [steps]", 1.0, ".0f"),
     "Terrain/level": ("terrain level", 1.0, ".2f"),
 }
-"""Tag -> heading, factor and number format of a column of the table over the training."""
+"""Tag -> heading, factor and number format of its column in the table that shows figures over the training."""
 
 
 def write_report(folder: Path) -> Path:
@@ -115,7 +115,6 @@ def command_on(record: Record, command: str) -> str:
 
 
 def _facts(record: Record) -> list[list[Cell]]:
-    """Return rows (name, text) with facts about a run."""
     timing, code = record.timing, record.code
     found: dict[str, str | None] = {
         "began": f"{record.began:%Y-%m-%d %H:%M:%S}",
@@ -160,7 +159,6 @@ def _film(record: Record) -> list[Part]:
 
 
 def _differences(record: Record) -> list[Part]:
-    """Return the settings in which a run differs from its task."""
     heading, found = Heading("Settings other than the task's"), from_task_file(record)
     if found is None:
         told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
@@ -168,7 +166,7 @@ def _differences(record: Record) -> list[Part]:
         set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in record.changes.items()]
         return [heading, Paragraph(text), *([Table(["setting", "the command line"], set_there)] if set_there else [])]
     if not found:
-        return [heading, Paragraph("None: the run is its task as the task is now.")]
+        return [heading, Paragraph("None: the run has the settings that its task has now.")]
     rows: list[list[Cell]] = [[Mono(path), Mono(words(own)), Mono(words(of_task))] for path, (own, of_task) in found.items()]
     return [heading, Table(["setting", "this run", "the task's files now"], rows)]
 
@@ -206,9 +204,9 @@ def _evaluations(record: Record) -> list[Part]:
     results = [(engine_of(name).label, result) for name, result in record.results.items()]
     for label, result in results:
         if file := record.another_policy(result):
-            parts.append(Paragraph(f"In {label} it is of `{file}`, which is not the last policy."))
+            parts.append(Paragraph(f"In {label} the evaluation is of `{file}`, which is not the last policy."))
         if result.get("changes"):
-            parts.append(Paragraph(f"In {label} it was made with {changes_text(result)}."))
+            parts.append(Paragraph(f"In {label} the evaluation was made with {changes_text(result)}."))
     following = [(label, result) for label, result in results if "episodes" not in result]
     tracked = [(label, tracking_of(result)) for label, result in following if has_tracking(result)]
     rows: list[list[Cell]] = []
@@ -243,7 +241,6 @@ def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
 
 
 def _episodes(label: str, episodes: dict[str, Any]) -> list[Part]:
-    """Return a sentence and a table on an evaluation by full episodes."""
     rows: list[list[Cell]] = []
     for measure, key in (("return", "return"), ("length [control steps]", "length")):
         rows.append([measure, *(number(episodes[key][part], ".1f") for part in ("mean", "std", "min", "max"))])
@@ -265,8 +262,8 @@ def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
     because the run itself is complete.
 
     If `film_with` is given, a second process films the policy and writes the report again with the film. `film_with` holds
-    the options with which that process finds the run's task. This process does not wait for it; LOG in the run folder keeps
-    its output. The film has its own process because a graphics driver that fails may end the process or hang.
+    command-line options with which the second process finds the run's task. The film has its own process because a failing
+    graphics driver may end or block a process. The second process writes to LOG in the run folder; nothing waits for it.
     """
     start = time.perf_counter()
     try:

@@ -1,6 +1,4 @@
-"""The disturbances of the stress test: their table, which is scaled to the robot's size, and a task in which each robot has
-another disturbance.
-"""
+"""The stress test's table of disturbances, which is scaled to the robot's size, and a task with disturbed robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -21,22 +19,22 @@ from legged.robots.similarity import Size, grown
 from legged.terrain import Terrain
 
 WRITTEN_FOR = "anymal_c"
-"""Robot for which the numbers below are written. They are scaled for other robots."""
+"""Robot for which the numbers of the table are written. They are scaled for other robots."""
 
 PUSH_INTERVAL = 5.0
 """Time between two pushes of a robot [s]."""
 
 
 def _told(text: str, unit: str = "", default: float | None = 0.0) -> Any:
-    """Return a dataclass field with the `text` that describes its number. With a `unit` the number scales with the robot;
-    delays, angles and shares do not scale.
+    """Return a dataclass field whose value is described by `text`, with `{}` in place of the value. A value with a `unit` is
+    scaled to the robot's size; delays, angles and shares are not, so they have no `unit`.
     """
     return field(default=default, metadata={"text": text, "unit": unit})
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbances of one robot, its sensors and its motors, constant over time. "Either way" means with either sign."""
+    """Disturbances of one robot, its sensors and its motors. "Either way" means with a positive or a negative sign."""
 
     name: str
     payload: float = _told("{:g} kg on the base", "kg")
@@ -44,13 +42,13 @@ class Disturbance:
     friction: float | None = _told("friction {:g}", default=None)
     """Sliding friction of all contacts of the robot; None keeps the nominal friction [1]."""
     motors: float = _told("motors at {:.0%}", default=1.0)
-    """Factor on the torque of every motor and on its limit [1]."""
+    """Factor on every motor's torque and torque limit [1]."""
     delay: float = _told("targets {:g} s late")
     """Delay of the targets on the way to the motors [s]."""
     push: float = _told(f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s", "m/s")
-    """Largest velocity, either way, to which the base is set along the world's x and y every PUSH_INTERVAL [m/s]."""
+    """Every PUSH_INTERVAL the base gets a random velocity along the world's x and y, up to this, either way [m/s]."""
     zero_offset: float = _told("encoders up to {:g} rad off")
-    """Largest random error of the encoders, either way [rad]. Both policy and motors use the wrong angle."""
+    """Largest random error of the encoders, either way [rad]. Policy and motors both use the wrong angles."""
     tilt: float = _told("inertial sensor askew by {:g} rad")
     """Tilt of the inertial sensor about a random horizontal axis [rad]."""
     map_height: float = _told("height map {:g} m too high or low", "m")
@@ -62,7 +60,7 @@ class Disturbance:
 
     @property
     def changes(self) -> dict[str, float]:
-        """Return name of a field -> number, for the fields that differ from their defaults."""
+        """Return name of a field -> its value, for the fields that do not have their default value."""
         return {one.name: getattr(self, one.name) for one in fields(self)[1:] if getattr(self, one.name) != one.default}
 
     @property
@@ -73,9 +71,9 @@ class Disturbance:
 
 
 GIVEN = ("friction", "added_base_mass", "motor_strength", "joint_offset")
-"""Properties of domain_rand.ranges that the lines of the table set."""
+"""Properties in domain_rand.ranges that the disturbances set."""
 MOST = ("push", "map_height", "map_shift", "map_holes")
-"""Disturbances whose largest value over all robots is written into the task's configuration."""
+"""Disturbances whose largest value over all robots is set in the task's configuration."""
 NOMINAL = Disturbance("nominal")
 ALONE = (
     Disturbance("payload", payload=8.0),
@@ -94,15 +92,15 @@ ALONE = (
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
 """Disturbances of the line `together`, which are common on hardware."""
 WORST = ("delay 40 ms", "no map")
-"""Disturbances that are not part of the line `everything`, which has a smaller one of the same kind."""
+"""Disturbances that are left out of the line `everything`, because it has a weaker one of the same kind."""
 
 NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
-"""Names of all lines."""
+"""Names of all lines of the table."""
 
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
-    """Return all lines of the table for a robot of the size `robot`: no disturbance, each alone, TOGETHER, and everything.
-    Numbers are scaled from the size `anymal` and rounded to two digits. A `payload` [kg] replaces that of the table.
+    """Return all lines of the table for a robot of the size `robot`: no disturbance, each of ALONE, `together`, `everything`.
+    Numbers are scaled from the size `anymal` and rounded to two digits. A `payload` [kg] replaces that of ALONE.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:
@@ -113,7 +111,7 @@ def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Dist
 
 
 def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
-    """Return the disturbance `one`, scaled from the size `anymal` to `robot`."""
+    """Return the disturbance `one`, scaled from the size `anymal` to the size `robot`."""
     grow: dict[str, Any] = {
         of.name: float(f"{getattr(one, of.name) * grown(of.metadata['unit'], anymal, robot):.2g}")
         for of in fields(one)[1:]
@@ -123,7 +121,7 @@ def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
 
 
 def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
-    """Return one disturbance called `name` with the fields of all `parts`, which have no field in common."""
+    """Return one disturbance called `name` with the changed fields of all `parts`, which must not change the same field."""
     return Disturbance(name, **{key: value for part in parts for key, value in part.changes.items()})
 
 
@@ -131,8 +129,8 @@ def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
 
 
 def declared(rows: Sequence[Disturbance]) -> list[tuple[str, Any]]:
-    """Return overrides that enable the disturbances of all `rows` in a task. Each robot gets its own values when the task is
-    built.
+    """Return overrides that enable the disturbances of all `rows` in a task. `StressedTask` then gives each robot its own
+    values.
     """
     given = {"friction": True, "added_base_mass": True}
     given |= {"motor_strength": any(row.motors != 1.0 for row in rows), "joint_offset": any(row.zero_offset for row in rows)}
@@ -160,7 +158,7 @@ def late(rows: Sequence[Disturbance], cfg: LeggedConfig) -> list[tuple[str, Any]
 def make_stressed(
     rows: Sequence[Disturbance], cfg: LeggedConfig, device: torch.device, graph: bool, terrain: Terrain | None
 ) -> "StressedTask":
-    """Build the task of a configuration with one robot for each of N `rows`."""
+    """Build the task of `cfg` with N robots. Robot i has the disturbance rows[i]."""
     kind: Any = task_class(cfg.task)
     own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
     stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
@@ -169,10 +167,10 @@ def make_stressed(
 
 
 class GivenMap(HeightMapErrors):
-    """Errors of a height map that are given instead of drawn, and are the same in every episode."""
+    """Errors of a height map. Their values are given instead of random, and are the same in every episode."""
 
     given: tuple[Tensor, Tensor]
-    """Values of `error` and `holes`."""
+    """Given values of `error` and `holes`."""
 
     def advance(self, begun: Tensor) -> None:
         for own, given in zip((self.error, self.holes), self.given, strict=True):
@@ -180,8 +178,8 @@ class GivenMap(HeightMapErrors):
 
 
 class StressedTask(LeggedRobot):
-    """A mix-in before a task's class that gives each robot the disturbance of its row. The random numbers of disturbances are
-    drawn once, by a separate generator, so the task's own random numbers stay the same.
+    """A mix-in that gives each robot its own disturbance; it comes before the task's class. The disturbances' random numbers
+    come from a separate generator and are drawn once, so the task's other random numbers stay the same.
     """
 
     rows: tuple[Disturbance, ...] = ()
@@ -201,7 +199,7 @@ class StressedTask(LeggedRobot):
         self.reset()
 
     def _per_robot(self, name: str) -> Tensor:
-        """Return one field of each robot's disturbance, (N,)."""
+        """Return the field `name` of each robot's disturbance as a tensor (N,)."""
         values = [float(getattr(row, name)) for row in self.rows]
         return torch.tensor(values, dtype=torch.float32, device=torch.device(self.device))
 
@@ -246,7 +244,7 @@ class StressedTask(LeggedRobot):
             self.control.actuator.delay.copy_(torch.where(steps > 0.0, steps, own))
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return a height map with the errors of each robot's row instead of the task's errors."""
+        """Return a height map with the errors of the robots' disturbances, or None if they have none."""
         cfg, n = self.cfg.observations.height_map, self.num_envs
         if is_exact(cfg):
             return None

@@ -45,7 +45,7 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 RISER = 0.17
 """Height of the stairs' steps at terrain.scale 1 [m]."""
 TREAD = 0.28
-"""Width of the stairs' steps for robots of all sizes, as in houses [m]."""
+"""Width of the stairs' steps [m]. It is that of stairs in houses, and is not scaled to the robot's size."""
 STAIRS = ("stairs_up", "stairs_down")
 """Terrain types of the stairs: half of the robots go up, half go down."""
 GROUND = {"dense_blocks": 0.25, "kerbs": 0.17, "rubble": 0.2}
@@ -58,8 +58,8 @@ COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate), as shares of the lowest or the highest value of a grid axis; robots get them in
-turn."""
+"""Commands on the flat (vx, vy, yaw rate): positive numbers are shares of the highest value of the grid's axis, negative ones
+of the lowest value. The robots of a line get the commands in turn."""
 Changes = Sequence[tuple[str, Any]]
 """Overrides of a configuration."""
 HALF_STEP = "half the time step"
@@ -69,11 +69,11 @@ COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "gro
 LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
 COMBINED = ("together", "everything")
 SETTING_LINES = ("nominal", "together")
-"""Lines of the table that are measured with each solver setting; `full` measures all lines."""
+"""Lines of the table that are measured with each solver setting. With `full` all lines are measured."""
 
 
 def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
-    """Return name of a solver setting -> overrides, for all settings to try that the engine and the motors allow."""
+    """Return name of a solver setting -> overrides, for the settings that the engine and the actuator network support."""
     found: dict[str, list[tuple[str, Any]]] = {}
     network = cfg.control.actuator.network
     # An LSTM that models motors has learned one length of the physics step, so the step cannot be halved.
@@ -88,7 +88,7 @@ def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]
 
 
 def check_asked(changes: Changes) -> None:
-    """Check that the command line randomises no property that the lines of the table set."""
+    """Check that the overrides `changes` randomise none of the properties that the disturbances set."""
     ranges = "domain_rand.ranges"
     for key, value in changes:
         names = value if key == ranges and isinstance(value, dict) else [key.removeprefix(f"{ranges}.").split(".")[0]]
@@ -110,12 +110,12 @@ class Bench:
         payload: float | None = None,
         lines: Sequence[str] = (),
     ) -> None:
-        """Prepare a test with `robots` robots for each line of the table. `riser` (by default RISER times the scale) and
-        `tread` are the height and the width of the steps [m], `payload` (by default the table's) is the mass on the base
-        [kg], and `lines` (by default all) are the names of the lines to measure.
+        """Prepare a test with `robots` robots for each line of the table. The steps of the stairs have the height `riser` [m]
+        and the width `tread` [m], and `payload` is the mass on the base [kg]. `lines` are the names of the lines to measure.
+        By default the height is RISER times the scale, the payload is that of the table, and all lines are measured.
 
         Raises:
-            ConfigError: the robot cannot be loaded, or an override randomises a property that the table sets.
+            ConfigError: the robot cannot be loaded, or an override randomises a property that the disturbances set.
         """
         check_asked(setting.overrides)
         self.setting, self.robots, self.tread = setting, robots, tread
@@ -131,10 +131,10 @@ class Bench:
         self.limit = LIMIT * sqrt(self.scale)
         """Largest RMS velocity error with which a robot counts as following its command [m/s]."""
         self.lost = 0
-        """Number of pairs of a robot and a control step in which contacts were lost because memory was full."""
+        """Number of times that a robot lost contacts in a control step, because memory was full."""
 
     def measure(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return the figures of the lines `rows` of the table. `changes` are overrides that choose a solver setting."""
+        """Measure the lines `rows` of the table and return their figures. `changes` are the overrides of a solver setting."""
         found: list[dict[str, Any]] = [{"name": row.name, "what": row.text} for row in rows]
         if not self.on_plane:
             for line, figures in zip(found, self.on_stairs(rows, changes), strict=True):
@@ -144,7 +144,7 @@ class Bench:
         return found
 
     def on_stairs(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return the success on stairs for each line; half of the robots go up, half go down."""
+        """Return the success on stairs for each line. Half of a line's robots go up, half go down."""
         half = max(1, self.robots // 2)
         per_robot = [row for _ in STAIRS for row in rows for _ in range(half)]
         cell = ("terrain.horizontal_scale", dividing_cell(self.tread, self.cfg.terrain.horizontal_scale))
@@ -155,7 +155,7 @@ class Bench:
         return [point(self.riser, *of_row) for of_row in zip(outcomes, times, strict=True)]
 
     def on_new_ground(self) -> dict[str, Any]:
-        """Return terrain type -> the success of undisturbed robots, for the types in GROUND."""
+        """Return terrain type -> success of undisturbed robots, for the types in GROUND."""
         specs = [TileSpec(name, round(size * self.scale, 6)) for name, size in GROUND.items()]
         found = self._run_out([NOMINAL] * (len(specs) * self.robots), specs)
         outcomes, times = (values.view(len(specs), self.robots) for values in found)
@@ -166,7 +166,7 @@ class Bench:
         return ground
 
     def on_flat(self, rows: Sequence[Disturbance], changes: Changes = ()) -> list[dict[str, Any]]:
-        """Return for each line the figures of robots that follow commands on a plane."""
+        """Let the robots of each line follow commands on a plane, and return the figures of each line."""
         per_robot = [row for row in rows for _ in range(self.robots)]
         ends = torch.tensor([[abs(axis[end]) for axis in axes_of(self.cfg).values()] for end in (0, -1)])
         parts = torch.tensor(COMMANDS)
@@ -188,13 +188,13 @@ class Bench:
         """Build a task with one robot for each of `rows`, and its policy. The overrides `own` apply first, then the user's,
         then `last`, so that a solver setting in `last` replaces the user's.
         """
-        gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not hold two
+        gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not have the memory for two tasks
         changes = [*own, *declared(rows), *self.setting.asked, *last]
         make = partial(make_stressed, rows)
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
 
     def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
-        """Let robots walk out of tiles of all `specs`; return outcomes (N,) and times (N,) [s]. `last`: see `_build`."""
+        """Let robots walk out of tiles of all `specs`; return outcomes (N,) and times (N,) [s]. For `last` see `_build`."""
         own = to_run_out(self.cfg, len(rows))
         cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
@@ -242,8 +242,8 @@ def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, 
 
 def evaluate_stress(bench: Bench, full: bool) -> int:
     """Run the stress test, print the result, write stress_<physics>.json and .png, and return the exit code. With `full` all
-    lines are measured with every solver setting. If the bench has only some of the lines, new ground and the score are left
-    out, and the solver settings too unless `full`.
+    lines are measured with every solver setting. If the bench has only some of the lines, there is no new ground and no
+    score, and solver settings are tried only with `full`.
 
     Raises:
         RunError: a file can't be written.
@@ -258,7 +258,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
     others = {}
     tried = settings(bench.cfg, engine) if full or bench.whole else {}
     if tried and HALF_STEP not in tried:
-        print(f"{HALF_STEP}: left out, because the motors' LSTM (control.actuator.network) knows one step only", flush=True)
+        print(f"{HALF_STEP}: left out; the LSTM in control.actuator.network works with one time step only", flush=True)
     for name, changes in tried.items():
         print(f"{name}: {len(few)} lines", flush=True)
         others[name] = bench.measure(few, changes)
@@ -293,7 +293,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
 
 
 def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] | None, dict[str, Any] | None]]:
-    """Return the rows of the printed table: kind (a key of COLORS), name, description, figures of success and of the flat."""
+    """Return rows: kind (key of COLORS), name, description, figures on stairs or new ground, and figures on the flat."""
     named = [("combined" if line["name"] in COMBINED else "table", line["name"], line) for line in result["lines"]]
     for name, lines in result["settings"].items():
         named += [("settings", f"{name}: {line['name']}", line) for line in lines]
@@ -305,7 +305,7 @@ def rows_of(result: dict[str, Any]) -> list[tuple[str, str, str, dict[str, Any] 
 
 
 def score_text(result: dict[str, Any]) -> str:
-    """Return the score as text, or where the lines were measured if there is no score."""
+    """Return the score as text. Without a score, return the ground on which the lines were measured."""
     found, rule = result["score"], result["definition"]
     if found is None:
         return f"stairs of {rule['riser_m']:g} x {rule['tread_m']:g} m" if "stairs" in result["lines"][0] else "on the flat"
@@ -340,7 +340,7 @@ def share_text(entry: dict[str, Any]) -> str:
 
 
 def draw_stress(result: dict[str, Any], path: Path) -> None:
-    """Draw bars for each line: success and commands followed on the flat, with their intervals, and the velocity error."""
+    """Draw three bars for each row of `rows_of`: success on stairs or new ground, success on the flat, and velocity error."""
     rows = rows_of(result)
     names = [name for _, name, *_ in rows]
     colors = [COLORS[kind] for kind, *_ in rows]
