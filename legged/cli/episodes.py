@@ -52,9 +52,7 @@ RECORDING = (
     argument("--as-trained", action="store_true", help="keep the training's noise, pushes, randomisation and curricula"),
     argument("--command", metavar="VX,VY,YAW", help="command of all episodes [m/s, m/s, rad/s]; random ones by default"),
     argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up; by default as in the training"),
-    argument(
-        "--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5 on the first and 0.8 on the next"
-    ),
+    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5 on the first, then 0.8"),
 )
 """Options of the recording."""
 LISTING = (
