@@ -66,7 +66,7 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
 """Columns of the table: heading, width in characters, and function from a row's figures to the text."""
 ENDS = "first iteration"
 CAPTURES = ("step captured", "training captured")
-"""Stages of a start that end when a CUDA graph has been captured, or on the CPU when the step has been checked."""
+"""Stages in which the start of a training captures a CUDA graph, or on the CPU checks the step."""
 Turn = tuple[Callable[[], object], Callable[[], object]]
 """Untimed preparation, and the timed function."""
 LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
@@ -86,7 +86,7 @@ STEPS = (
 """Arguments of benchmarks of control steps."""
 ITERATIONS = (
     *STEPS,
-    argument("--iterations", type=int, help="training iterations of each loop; 20 by default, 3 on the CPU, 0 for none"),
+    argument("--iterations", type=int, help="training iterations of each loop, or 0; 20 by default, 3 on the CPU"),
     argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)"),
     argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions by default"),
 )
@@ -137,7 +137,7 @@ def without(given: Sequence[str], *flags: str) -> list[str]:
 
 
 def _last_line(text: str, code: int) -> str:
-    """Return the last line of a process's error output, or its exit code `code` if it printed nothing."""
+    """Return the last line of a process's error output; if it printed nothing, return the exit code `code` as text."""
     return (text.strip().splitlines() or [f"exit code {code}"])[-1].removeprefix("error: ")
 
 
@@ -292,7 +292,6 @@ def startup(args: argparse.Namespace) -> int:
 
 def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
     """Start trainings with the arguments `given`, one to fill caches, then `repeats` more; return medians of these.
-
     `torch_s` is the time of `import torch`, `capture_s` the time for capturing graphs, and `stages` the end of each stage,
     since the start of the process [s]. `ratio` is the end of the first iteration, divided by `torch_s`.
     """
@@ -368,8 +367,8 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
     policy `act`, from observations to actions, or under random actions.
 
     Physics alone means `decimation` engine steps under the present torques, on a GPU as one graph. If mujoco-warp simulates
-    the robots, as many calls of its own `step` are timed as well. The functions take turns after each step, so that states,
-    contacts and clock rates are those of a rollout. If physics ran alone, without actions and resets, all robots would fall.
+    the robots, `decimation` calls of mujoco_warp.step are timed too. The functions take turns after each step, so that
+    states, contacts and clock rates are those of a rollout. Physics alone, without actions and resets, would make robots fall.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)
@@ -449,7 +448,7 @@ def synchronize(device: torch.device) -> None:
 
 
 def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
-    """Return the runners to time, by name of the loop: the loop `asked`, or all loops if it is None. Students of a `teacher`
+    """Return name -> runner of the training loops to time: the loop `asked`, or all if it is None. Students of a `teacher`
     and policies with an estimator have only the loop of the configuration.
     """
     own = cfg.train.runner.loop

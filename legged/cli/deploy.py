@@ -1,4 +1,4 @@
-"""`legged deploy`: a simulated robot that talks over UDP, and the robot's program together with it."""
+"""`legged deploy`: a simulated robot that is reached over UDP, alone or together with the robot's program."""
 
 import argparse
 import json
@@ -172,7 +172,7 @@ def terrain_of(args: argparse.Namespace) -> Terrain | None:
         *SIMULATION,
         *PROGRAM,
         argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default"),
-        argument("--film", action="store_true", help="film the first 30 s, in film.mp4"),
+        argument("--film", action="store_true", help="write a film of the first 30 s to film.mp4"),
     ),
 )
 def sim(args: argparse.Namespace) -> int:

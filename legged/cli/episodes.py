@@ -52,13 +52,13 @@ RECORDING = (
     argument("--as-trained", action="store_true", help="keep the training's noise, pushes, randomisation and curricula"),
     argument("--command", metavar="VX,VY,YAW", help="command of all episodes [m/s, m/s, rad/s]; random ones by default"),
     argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up; by default as in the training"),
-    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5 on the first, then 0.8"),
+    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
 )
 """Options of the recording."""
 LISTING = (
     argument("--sort", default=FELL, help=f"sort the list by this, worst first: {', '.join((FELL, *COLUMNS))}"),
     argument("--ended", metavar="TERM", help="list only episodes that this termination ended"),
-    argument("--top", type=int, default=TOP, help=f"episodes to list; {TOP} by default"),
+    argument("--top", type=int, default=TOP, help=f"number of episodes to list; {TOP} by default"),
     argument("--page", metavar="IDS", help="numbers of the episodes that get a page, e.g. 3 or 3,17"),
     argument("--worst", type=int, default=0, help="number of episodes at the top of the list that get a page"),
     argument("--parquet", action="store_true", help="also write all control steps as a Parquet table; needs pyarrow"),
@@ -219,9 +219,9 @@ def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
     arguments=_sources("logs/episodes/statistics", "policy"),
 )
 def statistics(args: argparse.Namespace) -> int:
-    """Measure mean and standard deviation of every joint: `legged episodes statistics anymal_c_flat --episodes 50`.
+    """Measure mean and standard deviation of joint states: `legged episodes statistics anymal_c_flat --episodes 50`.
 
-    The episodes are run for this purpose, unless a folder of recorded episodes is named.
+    They are those of every joint's angle, velocity and torque, over new episodes of a policy or over recorded episodes.
     """
     return _report(args, args.policy)
 

@@ -52,7 +52,7 @@ EVALUATED = (
         "--out",
         type=Path,
         help="folder for JSON and PNG files; by default the checkpoint's folder, or logs/evaluate for a shipped policy;"
-        " the subfolder changed/ of it if settings are overridden",
+        " if settings are overridden, its subfolder changed/",
     ),
 )
 """Arguments that all evaluations of a checkpoint have."""
@@ -67,7 +67,7 @@ GRID = (
 
 
 def _points(full: str) -> tuple[Argument, Argument]:
-    """Return the options for the number of robots at each size of a terrain type; `full` begins the help of --full."""
+    """Return the options for the number of robots at each size of a terrain type; `full` says what --full measures."""
     return (
         argument("--full", action="store_true", help=f"measure {full}, with 256 robots each"),
         argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full"),
@@ -142,7 +142,7 @@ def evaluate(args: argparse.Namespace) -> int:
 
 
 def _check_plain(args: argparse.Namespace) -> None:
-    """Refuse overrides and options that change nothing for an ONNX file: it runs in C MuJoCo as it is."""
+    """Refuse overrides and options that have no effect on an ONNX file, because C MuJoCo runs it as it is."""
     if args.overrides:
         raise ConfigError(f"{args.overrides[0]}: an ONNX file runs unchanged; see the options of `legged evaluate onnx`")
     for name, value in vars(evaluate.build_parser().parse_args([args.policy])).items():
@@ -189,7 +189,7 @@ def terrain(args: argparse.Namespace) -> int:
     cfg = setting.policy.cfg
     sizes = chosen_sizes(cfg, args.types, args.full, setting.cfg.terrain.scale)  # type: ignore[arg-type]
     if not sizes:
-        raise ConfigError(f"POLICY: '{cfg.task}' was trained on a plane; name terrain types to measure it on with --types")
+        raise ConfigError(f"POLICY: '{cfg.task}' was trained on a plane; choose terrain types with --types")
     return evaluate_following(setting, None, sizes, robots)
 
 
@@ -242,7 +242,7 @@ def checkpoints(args: argparse.Namespace) -> int:
     """Search a run for its first checkpoint that walks: `legged evaluate checkpoints anymal_c_flat`.
 
     Every checkpoint of the run is measured over the grid of commands. time_to_walk.json gives the time from the
-    start of the training's process to the first one that walks [s]. A small train.runner.save_interval makes it more exact.
+    start of the training's process to the first one that walks [s]. A smaller train.runner.save_interval makes it finer.
     """
     check_number("--rmse", args.rmse, 0, 100, above=True)
     check_number("--falls", args.falls, 0, 1, above=True)
@@ -455,7 +455,7 @@ def _follow_all(
 
 
 def _marks(policy: ForeignPolicy) -> dict[str, float]:
-    """Return the training's seconds `wall_s` and its `iterations`, those of them that the file states as numbers."""
+    """Return the training's seconds (`wall_s`) and `iterations` from the file's metadata, without those that it lacks."""
     found = {}
     for name in ("wall_s", "iterations"):
         try:

@@ -65,8 +65,8 @@ def fit_actuator(args: argparse.Namespace) -> int:
     and torque_limit. Sample at 200 Hz or more: motion between two samples can't be learned.
 
     Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are tested
-    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (a section control.actuator with the
-    parts), network.npz (for control.actuator.network), fit.json and fit.png.
+    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (the drive as a section
+    control.actuator), network.npz (for control.actuator.network), fit.json and fit.png.
     """
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
     updates = UPDATES[args.kind] if args.updates is None else args.updates

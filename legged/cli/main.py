@@ -65,7 +65,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command that `argv` begins with, by default the arguments of this process; return its exit code."""
+    """Run the command that `argv`, by default the arguments of this process, names first; return its exit code."""
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:

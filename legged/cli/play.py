@@ -53,7 +53,7 @@ SHOWN_ON_A_PLANE = 4
         *TILES,
         argument("--headless", action="store_true", help="open no window, even if there is a display"),
         argument("--gif", action="store_true", help="also write a GIF"),
-        argument("--no-video", action="store_true", help="export and measure only"),
+        argument("--no-video", action="store_true", help="film nothing; only export and measure"),
         argument("--out", type=Path, help="folder for video and exported/; the run folder by default"),
     ),
 )
@@ -76,9 +76,7 @@ def play(args: argparse.Namespace) -> int:
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
-                raise ConfigError(
-                    f"--{flag}: '{policy.cfg.task}' has no terrain to choose, because its ground is part of its model"
-                )
+                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose: its ground is part of its model")
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)

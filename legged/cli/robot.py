@@ -28,7 +28,7 @@ from legged.robots.importing.tree import Tree
 from legged.robots.robot import Robot, load_robot
 
 SINKS, STANDS = 0.8, 0.85
-"""If the base comes to rest below the first share of its default height, gains are raised until it reaches the second."""
+"""If the base sinks below the first share of its default height, gains are raised until the base stays above the second."""
 RAISED = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Factors to try on the P gains of the rule. D gains are multiplied by the square root of the factor."""
 ROOM_MB = 100.0
@@ -41,12 +41,10 @@ ROOM_MB = 100.0
     arguments=(
         argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
         argument("--name", help="name of the robot; by default the name of the file"),
-        argument("--out", type=Path, help="folder for the robot folder and the task; by default those of this clone"),
+        argument("--out", type=Path, help="folder for the robot folder and the task; by default resources/robots and cfg"),
         argument("--extends", metavar="TASK", help="task that the new task extends; one of base/ by default"),
         argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold still; may be repeated"),
-        argument(
-            "--packages", type=Path, action="append", default=[], help="folder in which to look for package:// paths too"
-        ),
+        argument("--packages", type=Path, action="append", default=[], help="folder in which to look for package:// files"),
         argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; by default from the file, or from a rule"),
         argument("--damping", type=float, help="D gain of all joints [N m s/rad]"),
         argument("--force", action="store_true", help="write over a robot with this name"),
@@ -124,9 +122,7 @@ def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
         higher = height_under_gains(robot, p, d)
         if higher >= STANDS * robot.height:
             guesses.stiffness, guesses.damping = raised
-            tree.say(
-                f"guess: gains are {factor:g} times the rule's. With the rule's gains {sinks}, with these to {higher:.3g} m"
-            )
+            tree.say(f"guess: gains are {factor:g} times the rule's. With the rule's {sinks}, with these to {higher:.3g} m")
             return True
     tree.say(f"{sinks}: check the gains and the rotors' inertia (armature), or give --stiffness and --damping")
     return True

@@ -43,7 +43,7 @@ LONGEST_FILM_S = 900.0
 """Time limit for filming [s]. A process that takes longer is taken to hang, and is ended."""
 LONGEST_NOTE = 1000
 MOST_COMPARED = 8
-"""Largest number of runs in a comparison. There are as many colours."""
+"""Largest number of runs in a comparison, because each run has a colour and there are eight."""
 PICTURE = "learning_curve.png"
 RUNS = (argument("runs", nargs="+", metavar="RUN", help="a run, its folder, or a task (its newest run)"), IMPORT)
 """The positional argument RUN, which takes one or more runs, and the option --import."""
@@ -157,7 +157,7 @@ def compare(args: argparse.Namespace) -> int:
     """Show several runs side by side: `legged runs compare A B`.
 
     comparison.html and .md show which settings differ, the learning curves in common plots, and the evaluations with
-    confidence intervals. Differences are those from the first run.
+    confidence intervals. Every run is compared with the first one.
     """
     if not 2 <= len(args.runs) <= MOST_COMPARED:
         raise ConfigError(f"RUN: expected 2 to {MOST_COMPARED} runs, got {len(args.runs)}")

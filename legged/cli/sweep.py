@@ -1,4 +1,4 @@
-"""`legged sweep`: search settings by many trainings, and report on them."""
+"""`legged sweep`: search for good settings by many trainings, and report on them."""
 
 import argparse
 import gc
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 TELL_S = 1.0
 """Interval at which the trials of other processes are read [s]."""
 MOST_STARTS = 10
-"""Largest number of starts of a worker, whose process is started again if a signal has killed it."""
+"""Largest number of times that a worker is started. A worker that a signal has killed is started again."""
 PRUNED = "ended early: other trials were better at that step"
 SIGNALLED = 128
-"""A training whose exit code is at least this was ended by a signal; the rest is the signal's number."""
+"""Exit code of a training that a signal ended, minus the signal's number."""
 MOST_FAILURES = 3
 """Number of failed trials in a row after which a worker gives up."""
 
@@ -165,7 +165,7 @@ class Stopped(Exception):
 
 
 class NoValue(Exception):
-    """Exception of a trial without a value, which counts as ended early; the text is the reason."""
+    """Exception of a trial without a value. The trial counts as ended early, and the text is the reason."""
 
 
 class Worker:

@@ -69,7 +69,7 @@ ROOM_MB = 16.0
         argument("--transfer", metavar="POLICY", help="begin with the networks of another training, of any task"),
         argument("--teacher", metavar="POLICY", help="policy that a student imitates (train.distillation.teacher)"),
         argument("--run-name", help="text that is appended to the run folder's name"),
-        argument("--max-iterations", type=int, help="iterations of the whole training, with those before --resume"),
+        argument("--max-iterations", type=int, help="iterations of the whole training, including those before --resume"),
         argument("--note", help="a sentence about this run, for its report and the table of all runs"),
         argument("--rl-device", help="device of the networks; that of the simulation by default"),
         argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)"),

@@ -49,7 +49,7 @@ POLICY = (argument("policy", metavar="POLICY", help=POLICY_HELP), CHECKPOINT, *B
 """The positional argument POLICY, --checkpoint, and the arguments of `BUILD`."""
 TILES = (
     argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; by default the types of the task"),
-    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; by default 0.5 on the first, then 0.8"),
+    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
 )
 """Options that choose the tiles on which a policy is shown."""
 

@@ -68,7 +68,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
 
 
 def _engine_warnings() -> AbstractContextManager[None]:
-    """Return a context in which each kind of MuJoCo's warnings is printed once; without MuJoCo it does nothing."""
+    """Return a context in which each kind of MuJoCo's warnings is printed once, if MuJoCo is imported."""
     if "mujoco" not in sys.modules:
         return nullcontext()
     from legged.physics.engine_warnings import each_warning_once
@@ -77,7 +77,7 @@ def _engine_warnings() -> AbstractContextManager[None]:
 
 
 class SubCommand:
-    """A command that calls a function with its parsed arguments. The command is called `legged <module> <function>`, or
+    """A command that parses its arguments and calls a function with them. It is called `legged <module> <function>`, or
     `legged <module>` if both have the same name. A `_` in a name becomes a hyphen, and a `_` at the end is left out.
 
     The arguments also have `words`, the list of words of the command line, and `start_s`, the start of the command on the
@@ -107,8 +107,8 @@ class SubCommand:
 
 
 def sub_command(*examples: str, arguments: Sequence[Argument] = ()) -> Callable[[Callable[..., int]], SubCommand]:
-    """Return a decorator that turns a function, from parsed arguments to an exit code, into a sub-command. In the help, the
-    function's docstring is the description, and `examples` are at the end.
+    """Return a decorator that makes a function a sub-command. The function takes parsed arguments and returns an exit code.
+    Its docstring is the description in the help, and `examples` are at the end of the help.
     """
     return lambda run: SubCommand(run, examples, arguments)
 

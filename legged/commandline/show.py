@@ -108,7 +108,7 @@ def _terminations(task: BaseTask) -> Iterator[str]:
 
 
 def _randomisation(task: BaseTask) -> Iterator[str]:
-    """Yield tables of randomised properties, including those that legged_gym's settings switch on, and of disturbances."""
+    """Yield two tables: randomised properties, also by settings with legged_gym's names, and disturbances."""
     rand, draws = task.cfg.domain_rand, task.randomization.draws
     drawn = {name: (draw, task.randomization.is_each(name)) for name, draw in draws.items()}
     pushes: list[tuple[str, str, str]] = []

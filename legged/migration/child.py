@@ -170,7 +170,7 @@ def _is_of_fork(module: str) -> bool:
 
 
 def define(name: str, data: dict[str, Any], parent: Any) -> type:
-    """Return a class with the values of a table. Nested tables become nested classes, except those by joint."""
+    """Return a class with the values of a table. Nested tables become nested classes, except tables of joints."""
     own: dict[str, Any] = {"__module__": BUILT_IN, "__qualname__": name}
     for key, value in data.items():
         nested = isinstance(value, dict) and key not in ("default_joint_angles", "stiffness", "damping")
@@ -315,7 +315,7 @@ def plain(value: Any) -> Any:
         raise NotPlain("is too large") from None
     if len(text) > LONGEST:
         raise NotPlain("is too large")
-    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # makes -0.0 to 0.0
+    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # turns -0.0 into 0.0
 
 
 def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def _terrain(result: Translation, fork: Fork) -> None:
 
 
 def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, float]:
-    """Return terrain type -> share. The entries of `proportions` have types of the fork's `functions`, or legged_gym's."""
+    """Return terrain type -> share. `functions`, or else legged_gym's order, give the types for each of `proportions`."""
     shares: dict[str, float] = {}
     kinds = tables.TERRAINS if functions is None else functions
     for i, share in enumerate(proportions):
@@ -101,7 +101,7 @@ def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, 
 
 
 def _fits(result: Translation, name: str) -> bool:
-    """Return True if a terrain type fits on the fork's tiles. If not even `flat` fits, return to the default tiles."""
+    """Return True if a terrain type fits on the fork's tiles. If not even `flat` fits, take the default tiles."""
     sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
     try:
         check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
@@ -147,7 +147,7 @@ def _commands(result: Translation) -> None:
 
 
 def _contacts(result: Translation) -> None:
-    """Map self-collisions, and the friction range. PhysX averages it with the ground's friction; MuJoCo takes it as it is."""
+    """Map self-collisions, and the friction range to its mean with the ground's friction, because PhysX averages both."""
     own = result.get("domain_rand.friction_range", [])
     ground = result.get("terrain.static_friction", 1.0)
     if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
@@ -163,8 +163,8 @@ def _contacts(result: Translation) -> None:
 
 
 def _rewards(result: Translation, fork: Fork) -> None:
-    """Map the scales of rewards that have legged_gym's formula. For all other rewards, name the methods to paste; they get no
-    scale.
+    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale; note which methods the user
+    has to paste for them.
     """
     known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
     sigma, mapped, paste = "", set(), []
@@ -212,11 +212,9 @@ def _observations(result: Translation, fork: Fork) -> None:
         history = history or steps
         text = "guessed from their number, because no class was found near the file"
         if groups[0] is None:
-            text = f"{numbers[0]} numbers are not legged_gym's observations: the task has the default groups"
+            text = f"{numbers[0]} numbers are not legged_gym's observations: the default groups remain"
     elif fork.observations[0] is None:
-        text = (
-            f"{fork.methods['compute_observations'][0].place} joins them in an unknown way: the task has the default groups"
-        )
+        text = f"{fork.methods['compute_observations'][0].place} joins them in an unknown way: the default groups remain"
     else:
         own: list[str] = []
         groups = [part and _terms(part, own) for part in fork.observations]
@@ -248,7 +246,7 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
 
 
 def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
-    """Return legged_gym's terms that have `number` numbers in some number of steps, and this number of steps."""
+    """Return those of legged_gym's lists of terms, and the number of steps, that give `number` numbers; else None and 1."""
     joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if result.get("terrain.measure_heights", False):

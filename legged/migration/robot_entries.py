@@ -1,4 +1,4 @@
-"""Robot settings of a fork's configuration -> control tables of a task, and entries of robot.yaml."""
+"""Mapping of a fork's robot settings to control tables of a task and to entries of robot.yaml."""
 
 import re
 from pathlib import Path
@@ -113,7 +113,7 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
 def _contacts(
     result: Translation, theirs: str, patterns: list[str], shapes: Shapes, robot: str
 ) -> tuple[list[str], set[int]]:
-    """Return the patterns that match shapes, or names of shapes in their place, and the indices of the matched shapes."""
+    """Return the patterns that match, some replaced by names of shapes, and the indices of the matched shapes."""
     found: set[int] = set()
     kept: list[str] = []
     for pattern in patterns:

@@ -158,4 +158,4 @@ PARTS = {
     "dof_pos": {"self.dof_pos", "self.default_dof_pos"},
     "heights": {"torch.clip", "self.root_states[:, 2].unsqueeze", "1", "0.5", "self.measured_heights", "-1", "1.0"},
 }
-"""Observation term of this package -> names and numbers from which a fork computes the same, without scales."""
+"""Observation term of this package -> names and numbers in a fork's formula for the same values, without scales."""

@@ -26,7 +26,7 @@ class Lost:
     setting: str
     value: str
     reason: str
-    """Reason why it is lost, or the nearest setting of this package; empty if no setting is near."""
+    """Reason for the loss, or the nearest setting of this package; empty if no setting is near."""
 
     def __str__(self) -> str:
         value = f" = {self.value}" if self.value else ""
@@ -53,7 +53,7 @@ class Translation:
 
     def get(self, path: str, default: Any = None) -> Any:
         """Return the fork's value of the setting `path`; `default` if it is not set or unknown. If `default` is a float, a
-        list or a table, a value that is not a number, a list of numbers or a table of numbers is recorded as lost.
+        list or a table, the value must be a number, or a list or table of numbers; otherwise it is recorded as lost.
         """
         self.done.add(path)
         found, kind, fits = self.theirs.get(path), "", True
@@ -85,7 +85,7 @@ class Translation:
             self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path` of the task to the value of the fork's setting `theirs`. If the schema refuses it, record it as lost."""
+        """Set `path` to `value`, which comes from the fork's setting `theirs`. Record `theirs` as lost if it is refused."""
         self.done.add(theirs)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")
@@ -104,7 +104,7 @@ class Translation:
             self.comments[path] = comment
 
     def take(self, table: Mapping[str, str]) -> None:
-        """Map the settings that the fork sets, by a table: path in the fork -> path in this package."""
+        """Map the fork's settings that are in `table`: path in the fork -> path in this package."""
         for theirs, ours in table.items():
             found = self.theirs.get(theirs)
             if found is not None and found.why_unknown:

@@ -28,7 +28,7 @@ NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
 
 @dataclass(frozen=True)
 class ParameterConfig:
-    """The values to try of a setting: a range or a list of choices."""
+    """Values that are tried for a setting: a range or a list of choices."""
 
     low: float | None = field(default=None, metadata=NUMBER)
     """Least value."""
@@ -152,8 +152,8 @@ class Plan:
 
     @property
     def negated(self) -> bool:
-        """True if figures are reported to Optuna with the opposite sign during a training. They must be if more of the figure
-        is better, but less of the trial's value, which is the time or the number of steps to the target.
+        """True if figures are reported to Optuna with the opposite sign. Optuna then minimises the time or the steps to a
+        target, but a larger figure is better.
         """
         return self.until_target and not lower_is_better(self.figure)
 
@@ -176,7 +176,7 @@ class Plan:
         )
 
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
-        """Return the arguments of `legged train` for trial `number`. They switch on evaluations, which compare the trials.
+        """Return the arguments of `legged train` for trial `number`. They switch on evaluations, to compare the trials.
         They switch off report and film, because these take longer than many trials; `legged runs report` makes them later.
         """
         runner, target = self.cfg.train.runner, self.given.objective.target
@@ -194,7 +194,7 @@ class Plan:
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
 
     def note(self, values: Mapping[str, Any], number: int) -> str:
-        """Return the note for the runs of a trial: its drawn values."""
+        """Return the note for the runs of a trial: the values of its settings."""
         drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
         return f"trial {number} of {self.name}: {', '.join(drawn)}"
 

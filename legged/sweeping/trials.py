@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
 JOURNAL = "journal:"
-"""Prefix of a storage that is a file of Optuna's journal."""
+"""Prefix of a storage that is a journal file of Optuna."""
 BEAT_S = 10.0
 """Interval at which a process confirms that it works on its trial [s]."""
 GRACE_S = 120.0
@@ -53,7 +53,7 @@ class Trials:
         """Open the storage `asked`, or by default the storage that the plan names, or else sweep.db in the sweep's folder.
 
         Raises:
-            ConfigError: the storage holds another sweep of the same name, or it has an invalid name.
+            ConfigError: the storage holds another sweep of the same name, or the storage has an invalid name.
             RunError: the storage can't be reached.
         """
         import optuna

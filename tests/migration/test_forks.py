@@ -225,7 +225,7 @@ def test_observations_that_cannot_be_told_are_not_guessed_by_their_number(fork, 
     result = migrated(config, path=fork(dog=env))
     assert "groups" not in result.data["observations"]
     assert (
-        f"observations: {place(env, 'def compute_observations', 'dog')} joins them in an unknown way: the task has the"
+        f"observations: {place(env, 'def compute_observations', 'dog')} joins them in an unknown way: the default"
         in result.out
     )
 
