@@ -44,7 +44,7 @@ from legged.registry import make_task, task_config
 
 RESULT = "benchmark.json"
 KERNEL_STEPS = 20
-"""Number of control steps over which --kernels takes the mean."""
+"""Number of control steps that --kernels measures."""
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],
     "terrain, our collider": [("sim.terrain_collider", "cells")],
@@ -368,7 +368,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
 
     Physics alone means `decimation` engine steps under the present torques, on a GPU as one graph. If mujoco-warp simulates
     the robots, `decimation` calls of mujoco_warp.step are timed too. The functions take turns after each step, so that
-    states, contacts and clock rates are those of a rollout. Physics alone, without actions and resets, would make robots fall.
+    states, contacts and clock rates are those of a rollout. With physics alone all robots would soon lie on the ground.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)

@@ -393,7 +393,7 @@ def _file(name: str) -> Path:
 
 
 def _description(file: Path, first: Path) -> Path:
-    """Return the policy.json next to `file`; if there is none, the one next to `first`."""
+    """Return the policy.json next to `file`, or else the policy.json next to `first`."""
     path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
     if path is None:
         raise ConfigError(f"{first}: there is no {EXPORTED[1]} next to it; describe its observation with --layout")

@@ -88,7 +88,7 @@ def _task_name(name: str) -> str:
 
 
 def _robot(asked: str | None, result: Translation) -> Robot | None:
-    """Return the robot `asked`, or by default the robot of this package that has the asset's name; None if there is none."""
+    """Return the robot `asked`, or by default the robot of this package that has the asset's name, if there is one."""
     if asked is not None:
         return load_robot(asked, "--robot")
     robots = data_folder("resources") / "robots"

@@ -382,7 +382,7 @@ def environment_classes(task_class: Any, root: Path) -> list[type]:
 
 
 def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> None:
-    """Run a function. Its arguments are the `values` of the same names, and stand-ins if there are none. `others` replace its
+    """Run a function. Its arguments are the `values` of the same names; stand-ins replace missing ones. `others` replace its
     globals of the same names.
     """
     run = types.FunctionType(function.__code__, function.__globals__ | others, None, None, function.__closure__)
