@@ -44,7 +44,7 @@ from legged.registry import make_task, task_config
 
 RESULT = "benchmark.json"
 KERNEL_STEPS = 20
-"""Number of control steps whose kernels --kernels times."""
+"""Number of control steps that --kernels measures."""
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],
     "terrain, our collider": [("sim.terrain_collider", "cells")],
@@ -54,7 +54,7 @@ GROUNDS: dict[str, list[tuple[str, Any]]] = {
 KILLED = -9
 """Exit code of a process that Linux ended because memory ran out."""
 NO_ROOM = "out of memory"
-"""Result if a number of robots does not fit into memory."""
+"""Text in the result if a number of robots does not fit into memory."""
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("robots", 12, lambda row: f"{row['num_envs']:,}"),
     ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
@@ -63,10 +63,10 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
     ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
 )
-"""Columns of the table: heading, width, text."""
+"""Columns of the table: heading, width in characters, and function from a row's figures to the text."""
 ENDS = "first iteration"
 CAPTURES = ("step captured", "training captured")
-"""Stages that end when a CUDA graph is captured, or on the CPU when the step is checked."""
+"""Stages in which the start of a training captures a CUDA graph, or on the CPU checks the step."""
 Turn = tuple[Callable[[], object], Callable[[], object]]
 """Untimed preparation, and the timed function."""
 LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
@@ -76,25 +76,25 @@ LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": Captured
 MEASURED = (
     *TASK,
     argument("--repeats", type=int, default=5, help="number of measurements, whose median is the result; 5 by default"),
-    argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written"),
+    argument("--out", type=Path, help=f"folder for {RESULT}; no file is written by default"),
 )
 """Arguments of all benchmarks."""
 STEPS = (
     *MEASURED,
-    argument("--steps", type=int, default=200, help="control steps of a measurement; 200 by default"),
+    argument("--steps", type=int, default=200, help="control steps of each measurement; 200 by default"),
 )
 """Arguments of benchmarks of control steps."""
 ITERATIONS = (
     *STEPS,
-    argument("--iterations", type=int, help="training iterations of each loop; 20 by default, 3 on the CPU, 0 for none"),
+    argument("--iterations", type=int, help="training iterations of each loop, or 0; 20 by default, 3 on the CPU"),
     argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)"),
-    argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions without it"),
+    argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions by default"),
 )
 """Arguments of benchmarks of control steps and iterations."""
 
 
 def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
-    """Check the arguments that commands share; return the configuration and the device."""
+    """Check the arguments that all benchmarks share; return the configuration and the device."""
     register_given(args, "task")
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
@@ -108,7 +108,7 @@ def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
 def _measure(
     cfg: TaskConfig, device: torch.device, args: argparse.Namespace, policy: Path | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """Build a task and time its steps, under a checkpoint's policy or random actions; return the task and the figures."""
+    """Build a task and time its steps; return the task and the figures. Without a checkpoint `policy`, actions are random."""
     start = time.perf_counter()
     task = make_task(cfg, device, graph=not args.no_graph)
     synchronize(device)
@@ -129,7 +129,7 @@ def _add_memory(result: dict[str, Any], device: torch.device) -> None:
 
 
 def without(given: Sequence[str], *flags: str) -> list[str]:
-    """Return a command line without some options and their values."""
+    """Return the arguments `given` without the options `flags` and their values."""
     own = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for flag in flags:
         own.add_argument(flag)
@@ -137,7 +137,7 @@ def without(given: Sequence[str], *flags: str) -> list[str]:
 
 
 def _last_line(text: str, code: int) -> str:
-    """Return the last line of a process's error output, or its exit code `code` if it printed nothing."""
+    """Return the last line of a process's error output; if it printed nothing, return the exit code `code` as text."""
     return (text.strip().splitlines() or [f"exit code {code}"])[-1].removeprefix("error: ")
 
 
@@ -152,15 +152,15 @@ def _write(args: argparse.Namespace, result: Any) -> None:
     "legged benchmark step go2 --num-envs 8192 --policy go2",
     arguments=(
         *ITERATIONS,
-        argument("--kernels", type=int, metavar="COUNT", help="also list the COUNT slowest kernels (GPU)"),
+        argument("--kernels", type=int, metavar="COUNT", help="also list the COUNT slowest kernels; needs a GPU"),
     ),
 )
 def step(args: argparse.Namespace) -> int:
     """Time a control step, the physics in it, and training iterations: `legged benchmark step anymal_c_flat`.
 
-    Random actions move the robots, or a policy with `--policy`. Robots that flail under random actions need more solver
-    rounds where their physics is randomised or has dry friction. On a GPU the timed steps run under torch's sync debug mode
-    "error", which raises at any synchronisation with the host.
+    Random actions move the robots; with `--policy` a policy does. Under random actions robots flail. If the physics is
+    randomised or has dry friction, the solver then needs more iterations than for robots that walk. On a GPU, torch raises an
+    error if a timed step synchronises with the host.
     """
     cfg, device = _settle(args)
     if args.kernels is not None and device.type != "cuda":
@@ -195,7 +195,7 @@ def step(args: argparse.Namespace) -> int:
 def scale(args: argparse.Namespace) -> int:
     """Measure speed and memory against the number of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
 
-    Each number of robots is measured as by `legged benchmark step`, in a separate process, so that it has all memory.
+    For each number of robots a separate process runs `legged benchmark step`, so that each measurement has all memory.
     """
     sizes = [part.strip().replace("_", "") for part in args.robots.split(",")]
     if not all(size.isdecimal() and int(size) > 0 for size in sizes):
@@ -220,7 +220,7 @@ def scale(args: argparse.Namespace) -> int:
 
 
 def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Return the benchmark's results for `size` robots with these arguments, or the reason as `failed` if it has none.
+    """Run `legged benchmark step` for `size` robots in another process; return its results, or why it failed as `failed`.
     Raises ConfigError if the configuration does not allow this number of robots.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -272,7 +272,7 @@ def ground(args: argparse.Namespace) -> int:
     arguments=MEASURED,
 )
 def startup(args: argparse.Namespace) -> int:
-    """Time a training until it begins: `legged benchmark startup anymal_c_flat`.
+    """Measure how long a training takes to begin: `legged benchmark startup anymal_c_flat`.
 
     A training is started in a separate process and ended after its first iteration. The command prints the time at which each
     stage of the start ended, and the time of `import torch` alone [s].
@@ -282,8 +282,8 @@ def startup(args: argparse.Namespace) -> int:
     print(f"import torch: {times['torch_s']:.2f} s\na training, seconds since its process was started:")
     print(*(f"  {seconds:7.2f}  {name}" for name, seconds in times["stages"].items()), sep="\n")
     print(
-        f"to the first iteration: {times['ratio']:.2f} x import torch; less {times['capture_s']:.2f} s of capturing graphs:"
-        f" {times['ratio_without_capture']:.2f} x",
+        f"end of the first iteration: {times['ratio']:.2f} x import torch, or {times['ratio_without_capture']:.2f} x without"
+        f" {times['capture_s']:.2f} s for capturing graphs",
         flush=True,
     )
     _write(args, times)
@@ -291,9 +291,9 @@ def startup(args: argparse.Namespace) -> int:
 
 
 def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
-    """Return medians over `repeats` runs, which follow a run that fills caches: `torch_s`, the time of `import torch`;
-    `stages`, the end of each stage of a training with the arguments `given`, since the start of its process; `capture_s`;
-    the `ratio` of the end of the first iteration to `torch_s`; and `ratio_without_capture`. Times are in seconds.
+    """Start trainings with the arguments `given`, one to fill caches, then `repeats` more; return medians of these.
+    `torch_s` is the time of `import torch`, `capture_s` the time for capturing graphs, and `stages` the end of each stage,
+    since the start of the process [s]. `ratio` is the end of the first iteration, divided by `torch_s`.
     """
     training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
     runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]
@@ -311,7 +311,7 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
 
 
 def _run(*arguments: str) -> dict[str, float]:
-    """Run Python in an empty folder; return the end of each stage of a start, and of the process as `end` [s]."""
+    """Run Python in an empty folder; return the seconds from its start to the end of each stage and to its own `end`."""
     with tempfile.TemporaryDirectory() as folder, tempfile.NamedTemporaryFile("r", encoding="utf-8") as file:
         # The child process runs in another folder. With this process's import path it finds user-defined modules, and this
         # package even if it is not installed.
@@ -332,10 +332,10 @@ def _run(*arguments: str) -> dict[str, float]:
 
 
 class Driver:
-    """Source of the robots' actions, random or from a policy; its time is not measured."""
+    """Source of the robots' actions: a policy or random numbers. The time that it takes is not measured."""
 
     def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor] | None) -> None:
-        """Use the policy `act`, observations -> actions, or random actions without one."""
+        """Take `act`, a policy from observations to actions; None for random actions."""
         self._task, self._act = task, act
         self._table = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=torch.device(task.device))
         self._made = 0
@@ -344,41 +344,40 @@ class Driver:
         """(N, D) actions of the next control step."""
 
     def decide(self) -> None:
-        """Choose the `actions` of the next control step."""
+        """Restore the kept state, and choose the `actions` of the next control step."""
         self.put_back()
         random = self._table[self._made % len(self._table)]
         self.actions.copy_(random if self._act is None else self._act(self._task.get_observations()))
         self._made += 1
 
     def keep(self) -> None:
-        """Store the physics' state if a policy acts, because the policy must not observe motion that it did not command."""
+        """If a policy acts, store the physics' state, so that `put_back` can undo engine steps that are timed alone."""
         if self._act is not None:
             self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
 
     def put_back(self) -> None:
-        """Restore the state of the last `keep`."""
+        """Restore the state that the last `keep` has stored."""
         if self._kept:
             self._task.physics.load_state(self._kept)
 
 
 @torch.inference_mode()
 def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
-    """Return milliseconds per control step: of the task's step, and of its physics alone, under random actions or those of a
-    policy `act`, observations -> actions.
+    """Time a task's control step, and its physics alone; return milliseconds per control step. The robots move under the
+    policy `act`, from observations to actions, or under random actions.
 
-    Physics alone is `decimation` engine steps of the same model under the present torques. On a GPU they are one graph too.
-    If the task's step consists of mujoco-warp's parts, as many of mujoco-warp's own steps are timed as well. All are timed in
-    turns, step by step, so that states, contacts and clock rates are those of a rollout. Without a controller or resets, the
-    physics would soon simulate fallen robots only.
+    Physics alone means `decimation` engine steps under the present torques, on a GPU as one graph. If mujoco-warp simulates
+    the robots, `decimation` calls of mujoco_warp.step are timed too. The functions take turns after each step, so that
+    states, contacts and clock rates are those of a rollout. With physics alone all robots would soon lie on the ground.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)
-    for _ in range(50):  # robots land and spread over the states of a training
+    for _ in range(50):  # then robots have landed and are in states like those of a training
         driver.decide()
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # takes minutes on a CPU
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # compiling takes minutes on a CPU
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
     turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]
@@ -408,7 +407,7 @@ def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], No
 
 
 def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> list[float]:
-    """Return mean milliseconds per call of each turn's timed function. On a GPU, waiting for the host raises an error."""
+    """Return the mean time of each timed function [ms]. On a GPU, synchronising with the host raises an error."""
     on_gpu = device.type == "cuda"
 
     def mark() -> Any:
@@ -438,7 +437,7 @@ def _time_in_turns(turns: Sequence[Turn], steps: int, device: torch.device) -> l
 
 
 def device_name(device: torch.device) -> str:
-    """Return the name of a device in results."""
+    """Return the name of a device for results."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
 
 
@@ -449,7 +448,7 @@ def synchronize(device: torch.device) -> None:
 
 
 def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
-    """Return the runners to time, by name of the loop: the loop `asked`, or all loops if it is None. Students of a `teacher`
+    """Return name -> runner of the training loops to time: the loop `asked`, or all if it is None. Students of a `teacher`
     and policies with an estimator have only the loop of the configuration.
     """
     own = cfg.train.runner.loop
@@ -460,8 +459,8 @@ def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dic
 
 
 def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
-    """Return the medians of rollout, update and iteration times, and the range of iteration times [ms]. They are measured
-    over `count` iterations of a training with new networks, after a first iteration that does not count.
+    """Train new networks with the runner `kind` for `count` iterations, after a first one that does not count. Return the
+    medians of rollout, update and iteration times, and the range of iteration times [ms].
     """
     shown: list[Progress] = []
     display = SimpleNamespace(show=shown.append)
@@ -483,9 +482,8 @@ def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> 
 
 
 def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
-    """Return the kernels of a control step, slowest first. The numbers are means over `steps` steps with small random
-    actions. `launches` is the number of launches in a control step, which varies with the iterations of solvers, and
-    `total_us` their GPU time [us].
+    """Return the kernels of a control step, slowest first, with means over `steps` steps under small random actions:
+    `launches`, the number of launches in a control step, and `total_us`, the GPU time of these launches [us].
     """
     actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
     task.step(actions)
@@ -500,7 +498,7 @@ def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
 
 
 def kernel_table(times: list[dict[str, Any]], longest: int) -> str:
-    """Return the `longest` slowest kernels and the sum of all as lines of text."""
+    """Return a table as text: the `longest` slowest kernels, and the sum of all kernels."""
     launches, total = (sum(time[key] for time in times) for key in ("launches", "total_us"))
     whole = {"name": f"all {len(times)} kernels of a control step", "launches": launches, "total_us": total}
     rows = [f"{time['total_us']:9.1f} {time['launches']:9.1f}  {time['name'][:90]}" for time in (*times[:longest], whole)]
@@ -517,9 +515,9 @@ def report(task: BaseTask, result: dict[str, Any]) -> str:
         *([f"  moved by {result['policy']}"] if "policy" in result else []),
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
         *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
-        *([f"  mujoco-warp's own launches: {task.physics.why_library}"] if task.physics.why_library else []),
-        f"  steps of a robot that lost contacts because memory was too small: {result['overflows']:.0f}",
-        f"  build, with kernel compilation where not cached: {result['build_s']:.1f} s",
+        *([f"  uses mujoco-warp's own launches; reason: {task.physics.why_library}"] if task.physics.why_library else []),
+        f"  robot steps with lost contacts, because their memory was too small: {result['overflows']:.0f}",
+        f"  building the task, with compilation of kernels that were not cached: {result['build_s']:.1f} s",
     ]
     for loop, times in result.get("iterations", {}).items():
         beyond = times["iteration_ms"] - times["steps_per_iteration"] * result["physics_ms"]

@@ -35,7 +35,7 @@ _legged_complete_names() { compgen -W "$(_legged_names)" -- "$1"; }
 _legged_complete_keys() { _legged_next_keys "$1"; }
 """
 LAST_IN_BASH = """
-# `legged evaluate` takes a policy in the place of a sub-command. No blank comes after a key, which goes on or gets a value.
+# After `legged evaluate` a policy may stand in the place of a sub-command. After a key no blank is added.
 _legged_complete() {
   _shtab_legged "$@"
   if [[ ${COMP_WORDS[1]} == evaluate && $COMP_CWORD == 2 && $2 != -* ]]; then
@@ -78,7 +78,7 @@ def whole_parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = load(name).build_parser()
-        for action in parser._actions if name != "migrate" else ():  # `migrate` takes the names of legged_gym's tasks
+        for action in parser._actions if name != "migrate" else ():  # `migrate --task` is a fork's task
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
@@ -93,8 +93,8 @@ def whole_parser() -> argparse.ArgumentParser:
 
 
 def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
-    """Return `key=` for all settings of tasks of these classes. Maps by term, terrain type or property of the model have
-    one key for each entry.
+    """Return `key=` for all settings of tasks of the classes `kinds`. If a setting is a table of terms, terrain types or
+    properties of the model, each of these has a key.
     """
     found: set[str] = set()
     for kind in kinds:

@@ -1,4 +1,4 @@
-"""`legged deploy`: a simulated robot behind UDP, and the robot's program against it."""
+"""`legged deploy`: a simulated robot that is reached over UDP, alone or together with the robot's program."""
 
 import argparse
 import json
@@ -35,11 +35,11 @@ from legged.simulated_robot.server import Server
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, terrain_type
 
 LISTENING = "listening at "
-"""Beginning of the line with the address."""
+"""Beginning of the line in which `legged deploy robot` prints its address."""
 REPORT, POSES = "report.json", "poses.npy"
-"""Files in the folder of a run."""
+"""Files that the simulated robot writes into the folder of --out."""
 PRIORITY = 10
-"""Real-time priority (1 to 99). The program's priority is higher."""
+"""Real-time priority of the simulated robot, from 1 to 99. That of the robot's program is higher."""
 BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 ROOM_MB = 16.0
@@ -50,20 +50,20 @@ DID_NOT_RUN = (EXIT_WRONG_INPUT, INTERRUPTED)
 """Exit codes of a program that did not move the robot."""
 FILM = "film.mp4"
 SIZE = (640, 360)
-"""Width and height [pixels]."""
+"""Width and height of the film [pixels]."""
 AWAY = 3.45
 """Distance of the camera, in lengths of the robot."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 SIMULATION = (
-    argument("--terrain", metavar="TYPE", help="type of the tile it starts on, e.g. stairs_up; a plane by default"),
-    argument("--size", type=float, help="size of the tile, in the unit of its type, e.g. the height of a step [m]"),
-    argument("--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are whole cells; default 0.1"),
+    argument("--terrain", metavar="TYPE", help="type of tile on which the robot starts, e.g. stairs_up; by default a plane"),
+    argument("--size", type=float, help="size of the terrain, in the unit of its type, e.g. the height of a step [m]"),
+    argument("--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are multiples of it; default 0.1"),
     argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002"),
     argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0"),
     argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0"),
     argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1"),
-    argument("--ideal-motors", action="store_true", help="ideal motors, whatever the policy was trained with"),
+    argument("--ideal-motors", action="store_true", help="simulate ideal motors, even if the policy was trained with others"),
     argument(
         "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
     ),
@@ -78,11 +78,11 @@ SIMULATION = (
     arguments=(
         argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
         *SIMULATION,
-        argument("--contract", type=Path, help="policy.json that defines motors and height map; ideal motors without it"),
+        argument("--contract", type=Path, help="policy.json that defines motors and height map; by default motors are ideal"),
         argument(
             "--out",
             type=Path,
-            help=f"folder for {REPORT} and {POSES}, the poses of the first 30 s at 25 Hz",
+            help=f"folder for {REPORT}, and for {POSES} with the poses of the first 30 s at 25 Hz",
         ),
         argument("--seconds", type=float, default=3600.0, help="end after this time [s]; default 3600"),
     ),
@@ -90,9 +90,9 @@ SIMULATION = (
 def robot(args: argparse.Namespace) -> int:
     """Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
 
-    C MuJoCo simulates the robot in real time on this machine, with its own time step, behind a link that may delay and lose
-    packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot udp:127.0.0.1:PORT`
-    runs a policy on it.
+    C MuJoCo simulates the robot in real time, with the time step --sim-dt. The network connection to the robot can delay and
+    lose packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot
+    udp:127.0.0.1:PORT` runs a policy on the simulated robot.
     """
     check_simulation(args)
     if not args.seconds > 0.0:
@@ -135,8 +135,8 @@ def check_simulation(args: argparse.Namespace) -> None:
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
-    """Return the robot with the motors, rotors and control laws that the flags choose; by default those of the training of
-    the policy in `contract`.
+    """Return the robot with the inertia of its rotors, and its motors. By default both are those with which the policy in
+    `contract` was trained; the flags change them.
 
     Raises:
         ConfigError: as `motors_config`.
@@ -147,7 +147,7 @@ def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None)
 
 
 def scan_of(contract: Contract | None) -> str:
-    """Return the rule of height measurements (terrain.scan) for the policy in `contract`."""
+    """Return the rule (terrain.scan) by which the policy in `contract` measures heights; the default without a policy."""
     term = None if contract is None else contract.sources.get("heights")
     return SCANS[0] if term is None else term.scan
 
@@ -172,7 +172,7 @@ def terrain_of(args: argparse.Namespace) -> Terrain | None:
         *SIMULATION,
         *PROGRAM,
         argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default"),
-        argument("--film", action="store_true", help="draw the first half minute as film.mp4"),
+        argument("--film", action="store_true", help="write a film of the first 30 s to film.mp4"),
     ),
 )
 def sim(args: argparse.Namespace) -> int:
@@ -221,9 +221,7 @@ def _exported(name: str) -> Path:
             return given / EXPORTED
     policy = policy_of(name)
     if not isinstance(policy.cfg, LeggedConfig):
-        raise ConfigError(
-            f"POLICY: '{policy.cfg.task}' follows no commands; the program needs a policy of a legged robot that does"
-        )
+        raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; give a policy that follows velocity commands")
     folder = policy.output("deploy") / EXPORTED
     changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
@@ -233,8 +231,8 @@ def _exported(name: str) -> Path:
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
-    """Return the simulated robot: the one `given`, else the policy's. A contract names a robot without its folder. The folder
-    of a user-defined robot is in the configuration of the run that contains the export.
+    """Return the robot to simulate: `given`, or by default the policy's. The contract states only the name of the policy's
+    robot. If the robot is user-defined, its folder is in the configuration of the run whose folder contains `exported`.
     """
     if given is not None:
         return load_robot(given, "--robot")
@@ -269,7 +267,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         start_new_session=True,  # Ctrl-C must reach only the program, which stops the robot safely
     )
     program = None
-    if in_main_thread():  # a signal to this process ends the other two as well
+    if in_main_thread():  # SIGTERM to this process ends the other two as well
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None
@@ -300,7 +298,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
 
 
 def _wait(program: subprocess.Popen) -> int:
-    """Wait for the program, which receives the terminal's Ctrl-C itself; return its exit code."""
+    """Wait for the program; return its exit code. Ctrl-C is ignored, because the terminal sends it to the program too."""
     while True:
         try:
             return program.wait()
@@ -309,13 +307,13 @@ def _wait(program: subprocess.Popen) -> int:
 
 
 def _flags(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
-    """Return the given and default values of the named options as flags."""
+    """Return the options `names` with their values, as words of a command line."""
     given = {f"--{name.replace('_', '-')}": getattr(args, name) for name in names}
     return [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
 
 
 def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
-    """Write a film of the poses in `folder` with the states of its log.npz; no film if there are fewer than two.
+    """Film the poses in `folder`, with the program's states from log.npz as captions. Fewer than two poses give no film.
 
     Raises:
         RunError: this machine cannot render, or the film cannot be written.
@@ -323,7 +321,7 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
     poses = np.load(folder / POSES)
     log = np.load(folder / "log.npz")
     if len(poses) < 2 or "times" not in log:
-        (folder / FILM).unlink(missing_ok=True)  # another run may have left it
+        (folder / FILM).unlink(missing_ok=True)  # remove the film of an earlier run
         print(f"{folder}: no film, because the run was too short")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)

@@ -41,7 +41,7 @@ from legged.process.paths import exists, ready_to_write, relative, write_text
 from legged.tables import markdown_table, screen_table
 
 EPISODES, MOST_ROBOTS = 50, 256
-"""Default number of episodes, and largest default number of robots for them."""
+"""Default number of episodes, and largest number of robots that run them by default."""
 TOP = 10
 """Default number of listed episodes."""
 LIST = "episodes.md"
@@ -49,25 +49,25 @@ STEP_BYTES = 1200
 """Largest disk space for a control step of a robot [bytes]."""
 RECORDING = (
     argument("--episodes", type=int, default=EPISODES, help=f"number of episodes; {EPISODES} by default"),
-    argument("--as-trained", action="store_true", help="with noise, pushes, randomisation and curricula"),
-    argument("--command", metavar="VX,VY,YAW", help="the command, held throughout [m/s, m/s, rad/s]"),
-    argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up, not on the training's"),
-    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; 0.5 and 0.8 by default"),
+    argument("--as-trained", action="store_true", help="keep the training's noise, pushes, randomisation and curricula"),
+    argument("--command", metavar="VX,VY,YAW", help="command of all episodes [m/s, m/s, rad/s]; random ones by default"),
+    argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up; by default as in the training"),
+    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
 )
 """Options of the recording."""
 LISTING = (
-    argument("--sort", default=FELL, help=f"order of the list, the worst first: {', '.join((FELL, *COLUMNS))}"),
-    argument("--ended", metavar="TERM", help="only episodes that this termination ended"),
-    argument("--top", type=int, default=TOP, help=f"episodes to list; {TOP} by default"),
-    argument("--page", metavar="IDS", help="episodes to make pages of, by number: 3 or 3,17"),
+    argument("--sort", default=FELL, help=f"sort the list by this, worst first: {', '.join((FELL, *COLUMNS))}"),
+    argument("--ended", metavar="TERM", help="list only episodes that this termination ended"),
+    argument("--top", type=int, default=TOP, help=f"number of episodes to list; {TOP} by default"),
+    argument("--page", metavar="IDS", help="numbers of the episodes that get a page, e.g. 3 or 3,17"),
     argument("--worst", type=int, default=0, help="number of episodes at the top of the list that get a page"),
-    argument("--parquet", action="store_true", help="also write one flat table in Parquet; needs pyarrow"),
+    argument("--parquet", action="store_true", help="also write all control steps as a Parquet table; needs pyarrow"),
 )
-"""Options of the list of episodes and their pages."""
+"""Options of a list of episodes, and of pages about episodes."""
 
 
 def _wish_of(args: argparse.Namespace) -> Wish:
-    """Return the settings of the recording.
+    """Return the settings of the recording that the command line asks for.
 
     Raises:
         ConfigError: a number is out of bounds, or the command is malformed.
@@ -98,7 +98,7 @@ def _check_listing(args: argparse.Namespace) -> None:
 
 
 def _pages(text: str | None, count: int | None) -> list[int]:
-    """Return the numbers in --page; `count` is the number of episodes, None if it is not known yet.
+    """Return the episode numbers in `text`, the value of --page. `count` is the number of episodes, None if it is unknown.
 
     Raises:
         ConfigError: a part is not a number, or there is no such episode.
@@ -119,7 +119,7 @@ def _run_episodes(policy: TrainedPolicy, wish: Wish, args: argparse.Namespace) -
 
 
 def _show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
-    """Print the top of the list of episodes; write the whole list as Markdown into `folder`, with chosen pages and table."""
+    """Print the top of the list of episodes; write the list, the chosen pages and the Parquet table into `folder`."""
     figures = figures_of(episodes)
     order = order_of(figures, args.sort, args.ended)
     wanted = _pages(args.page, len(episodes)) + order[: args.worst]
@@ -153,8 +153,8 @@ def record(args: argparse.Namespace) -> int:
     """Record episodes and list the worst: `legged episodes record anymal_c_flat --worst 1`.
 
     Robots run whole episodes under a policy. episodes.npz and .json hold every state, command, action, torque, contact and
-    reward term; the worst episodes are listed. With --page or --worst, chosen episodes get pages with a film next to plots
-    that share a cursor.
+    reward term; the worst episodes are listed. With --page or --worst, chosen episodes get a page: a film and plots with a
+    common time cursor.
     """
     _check_listing(args)
     register_given(args, "policy")
@@ -203,8 +203,8 @@ def list_(args: argparse.Namespace) -> int:
 
 
 def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
-    """Return arguments that name policies or recordings, the options of a recording, and --out, `folder` by default."""
-    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "policy or recording to compare with")
+    """Return positional arguments `names` for policies or recordings, the options of a recording, and --out."""
+    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "policy or recording to compare the first with")
     return (
         *(argument(name, metavar="POLICY", help=says) for name, says in zip(names, helps, strict=False)),
         *BUILD,
@@ -219,9 +219,9 @@ def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
     arguments=_sources("logs/episodes/statistics", "policy"),
 )
 def statistics(args: argparse.Namespace) -> int:
-    """Measure mean and standard deviation of every joint: `legged episodes statistics anymal_c_flat --episodes 50`.
+    """Measure mean and standard deviation of joint states: `legged episodes statistics anymal_c_flat --episodes 50`.
 
-    The episodes are run for this purpose, unless a folder of recorded episodes is named.
+    They are those of every joint's angle, velocity and torque, over new episodes of a policy or over recorded episodes.
     """
     return _report(args, args.policy)
 
@@ -234,7 +234,7 @@ def statistics(args: argparse.Namespace) -> int:
 def compare(args: argparse.Namespace) -> int:
     """Show joint statistics of two policies side by side: `legged episodes compare anymal_c_flat logs/anymal_c_flat/RUN`.
 
-    Each is a policy, whose episodes are run for this purpose, or a folder of recorded episodes.
+    Either may be a policy, whose episodes are then run for this purpose, or a folder of recorded episodes.
     """
     return _report(args, args.policy, args.other)
 

@@ -52,7 +52,7 @@ EVALUATED = (
         "--out",
         type=Path,
         help="folder for JSON and PNG files; by default the checkpoint's folder, or logs/evaluate for a shipped policy;"
-        " its subfolder changed/ if settings are overridden",
+        " if settings are overridden, its subfolder changed/",
     ),
 )
 """Arguments that all evaluations of a checkpoint have."""
@@ -61,15 +61,15 @@ GRID = (
         argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
         for axis, unit in AXES.items()
     ),
-    argument("--robots", type=int, default=ROBOTS, help=f"robots for each cell; {ROBOTS} by default"),
+    argument("--robots", type=int, default=ROBOTS, help=f"robots for each command of the grid; {ROBOTS} by default"),
 )
 """Options of a grid of velocity commands."""
 
 
 def _points(full: str) -> tuple[Argument, Argument]:
-    """Return the options for the number of robots at each size of a terrain type; `full` is the help of --full."""
+    """Return the options for the number of robots at each size of a terrain type; `full` says what --full measures."""
     return (
-        argument("--full", action="store_true", help=f"{full}, and 256 robots each"),
+        argument("--full", action="store_true", help=f"measure {full}, with 256 robots each"),
         argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full"),
     )
 
@@ -105,7 +105,7 @@ def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
 
 
 def _grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
-    """Return the grid of commands from the options, or from the configuration for options that are not given.
+    """Return the grid of commands. An axis comes from its option or, without the option, from the configuration.
 
     Raises:
         ConfigError: an axis is malformed, or the grid is too large.
@@ -123,9 +123,9 @@ def _grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
 def evaluate(args: argparse.Namespace) -> int:
     """Measure a policy: `legged evaluate anymal_c_flat`.
 
-    A policy that follows velocity commands is measured over a grid of commands and, if it was trained on terrain, on terrain
-    of growing size, as `legged evaluate grid` and `legged evaluate terrain` do. Other policies run full episodes, as with
-    `legged evaluate episodes`. An ONNX file or an exported folder is measured as by `legged evaluate onnx`.
+    A policy that follows velocity commands is measured as by `legged evaluate grid`. If it was trained on terrain, it is also
+    measured as by `legged evaluate terrain`. Other policies are measured as by `legged evaluate episodes`, an ONNX file or an
+    exported folder as by `legged evaluate onnx`.
 
     The tables are printed; evaluation_<physics>.json and pictures are written beside the checkpoint.
     """
@@ -142,7 +142,7 @@ def evaluate(args: argparse.Namespace) -> int:
 
 
 def _check_plain(args: argparse.Namespace) -> None:
-    """Check that no option is given that has no effect on an ONNX file, which runs in C MuJoCo unchanged."""
+    """Refuse overrides and options that have no effect on an ONNX file, because C MuJoCo runs it as it is."""
     if args.overrides:
         raise ConfigError(f"{args.overrides[0]}: an ONNX file runs unchanged; see the options of `legged evaluate onnx`")
     for name, value in vars(evaluate.build_parser().parse_args([args.policy])).items():
@@ -189,9 +189,7 @@ def terrain(args: argparse.Namespace) -> int:
     cfg = setting.policy.cfg
     sizes = chosen_sizes(cfg, args.types, args.full, setting.cfg.terrain.scale)  # type: ignore[arg-type]
     if not sizes:
-        raise ConfigError(
-            f"POLICY: '{cfg.task}' was trained on a plane; name the terrain types that it should cross with --types"
-        )
+        raise ConfigError(f"POLICY: '{cfg.task}' was trained on a plane; choose terrain types with --types")
     return evaluate_following(setting, None, sizes, robots)
 
 
@@ -200,10 +198,10 @@ def terrain(args: argparse.Namespace) -> int:
     "legged evaluate stress go2 --lines nominal,payload,together --riser 0.12",
     arguments=(
         *EVALUATED,
-        argument("--lines", help="lines of the table, e.g. 'nominal,payload,together'; all, and a score, by default"),
-        argument("--riser", type=float, help=f"height of a step [m]; {RISER} for a robot half a metre high"),
+        argument("--lines", help="lines of the table, e.g. 'nominal,payload,together'; by default all, with a score"),
+        argument("--riser", type=float, help=f"height of a step [m]; by default {RISER}, scaled to the robot's size"),
         argument("--tread", type=float, default=TREAD, help=f"width of a step [m]; {TREAD} by default"),
-        argument("--payload", type=float, help="mass on the base [kg]; 8 kg for an ANYmal C, in proportion for others"),
+        argument("--payload", type=float, help="mass on the base [kg]; by default 8, scaled to the robot's mass"),
         *_points("all lines with every solver"),
     ),
 )
@@ -241,10 +239,10 @@ def stress(args: argparse.Namespace) -> int:
     ),
 )
 def checkpoints(args: argparse.Namespace) -> int:
-    """Find the first checkpoint of a run that walks: `legged evaluate checkpoints anymal_c_flat`.
+    """Search a run for its first checkpoint that walks: `legged evaluate checkpoints anymal_c_flat`.
 
-    Every checkpoint of the run is measured over the grid of commands. time_to_walk.json says after how many seconds, counted
-    from the start of the training's process, the first one walked. A small train.runner.save_interval makes the answer finer.
+    Every checkpoint of the run is measured over the grid of commands. time_to_walk.json gives the time from the
+    start of the training's process to the first one that walks [s]. A smaller train.runner.save_interval makes it finer.
     """
     check_number("--rmse", args.rmse, 0, 100, above=True)
     check_number("--falls", args.falls, 0, 1, above=True)
@@ -267,8 +265,7 @@ def _episodes(count: int) -> Argument:
 def episodes(args: argparse.Namespace) -> int:
     """Measure returns and lengths of full episodes: `legged evaluate episodes half_cheetah`.
 
-    Tasks without velocity commands are measured, in one of the engines of this package. The figures are printed and written
-    to evaluation_<physics>.json.
+    The command is for tasks without velocity commands. The figures are printed and written to evaluation_<physics>.json.
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     setting = _settle(args, follows=False)
@@ -302,9 +299,9 @@ def gymnasium(args: argparse.Namespace) -> int:
 COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0))
 """Default commands: vx, vy [m/s], yaw rate [rad/s]."""
 SECONDS, HOLD_S = 8.0, Grid.hold_s
-"""Default length of a single command, and of a command of a grid [s]."""
+"""Default time for which a robot follows a command: one of a list, and one of a grid [s]."""
 MOST_CELLS = 10_000
-"""Largest number of commands of a grid, because one robot takes seconds for each."""
+"""Largest number of commands of a grid. A single robot follows them one after the other, for seconds each."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
 """Files of an exported folder: the network, and its description."""
@@ -315,7 +312,7 @@ EXPORTED = ("policy.onnx", "policy.json")
     "legged evaluate onnx policy.onnx --robot g1 --layout holosoma",
     arguments=(
         argument("policy", nargs="+", metavar="POLICY", help="ONNX files, or exported folders"),
-        argument("--robot", help="name or folder of the robot; that of the policy.json by default"),
+        argument("--robot", help="name or folder of the robot; by default as in the policy.json"),
         argument(
             "--layout",
             help="description of the observation: a YAML file, 'holosoma', or a policy.json; by default the policy.json"
@@ -323,13 +320,13 @@ EXPORTED = ("policy.onnx", "policy.json")
         ),
         argument("--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"),
         *(
-            argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if only other axes are given")
+            argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another axis is given")
             for axis, unit in AXES.items()
         ),
         argument("--seconds", type=float, help=f"length of each command [s]; default {SECONDS:g}, or {HOLD_S:g} with a grid"),
         argument("--friction", type=float, default=0.8, help="friction between robot and ground; 0.8 by default"),
         argument("--rmse", type=float, help="largest mean velocity RMSE of a policy that follows the grid [m/s]"),
-        argument("--out", type=Path, help=f"folder for {RESULT}; without it nothing is written"),
+        argument("--out", type=Path, help=f"folder for {RESULT}; no file is written by default"),
     ),
 )
 def onnx(args: argparse.Namespace) -> int:
@@ -339,8 +336,8 @@ def onnx(args: argparse.Namespace) -> int:
     frames, joint order and gains are those of the training. An exported policy of this package has a policy.json next to it,
     which describes robot and control; for a foreign policy give --robot and --layout.
 
-    With --vx, --vy or --yaw a grid of commands is measured as by `legged evaluate grid`. With --rmse too, the command prints
-    the first of several files, such as the checkpoints of a training, that follows the grid.
+    With --vx, --vy or --yaw a grid of commands is measured as by `legged evaluate grid`. With --rmse the
+    command also prints the first of the policies that follows the grid with at most this error and without a fall.
     """
     grid = _grid_in(args)
     settling = grid.settle_s if grid else SETTLING_S
@@ -360,7 +357,7 @@ def onnx(args: argparse.Namespace) -> int:
     robot = load_robot(args.robot or contract.robot, "--robot")  # type: ignore[union-attr]
     policies = [ForeignPolicy(path, layout, robot) for path, layout in zip(files, layouts, strict=True)]
     if contract is not None and was_trained_with_other_motors(contract):
-        told = "the policy was trained with other motors (see `actuator` in it) than the ideal motors used here"
+        told = "the policy was trained with other motors (`actuator` in this file) than the ideal ones used here"
         print(f"warning: {contract.path}: {told}", file=sys.stderr, flush=True)
     if grid:
         result = _follow_all(robot, policies, files, args, grid)
@@ -391,12 +388,12 @@ def _file(name: str) -> Path:
     """Return the ONNX file that POLICY names."""
     path = _exported_file(name)
     if path is None or not exists(path) or not path.is_file():
-        raise ConfigError(f"POLICY: there is no ONNX file '{name}', nor is it an exported folder (with {EXPORTED[0]})")
+        raise ConfigError(f"POLICY: there is no ONNX file '{name}', and no exported folder (with {EXPORTED[0]}) of this name")
     return path
 
 
 def _description(file: Path, first: Path) -> Path:
-    """Return the policy.json next to a file, or else next to the first file."""
+    """Return the policy.json next to `file`, or else the policy.json next to `first`."""
     path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
     if path is None:
         raise ConfigError(f"{first}: there is no {EXPORTED[1]} next to it; describe its observation with --layout")
@@ -407,10 +404,10 @@ def _grid_in(args: argparse.Namespace) -> Grid | None:
     """Return the grid of the command line; None without --vx, --vy and --yaw."""
     if all(getattr(args, axis) is None for axis in AXES):
         if args.rmse is not None:
-            raise ConfigError("--rmse: is a limit of a grid of commands; add --vx, --vy or --yaw")
+            raise ConfigError("--rmse: limits the error on a grid of commands, and there is no grid; add --vx, --vy or --yaw")
         return None
     if args.command:
-        raise ConfigError("--command: is not part of a grid; leave out either it or --vx, --vy and --yaw")
+        raise ConfigError("--command: replaces a grid; leave out either --command or --vx, --vy and --yaw")
     check_number("--rmse", args.rmse, 0, 100, above=True)
     given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
     vx, vy, yaw = (axis_values(f"--{axis}", text) for axis, text in given.items())
@@ -424,8 +421,8 @@ def _grid_in(args: argparse.Namespace) -> Grid | None:
 def _follow_all(
     robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
-    """Measure every policy on the grid, print a line about each, and return all figures. Policies that state
-    their training time are sorted by this time.
+    """Measure every policy on the grid, print a line about each, and return all figures. Policies are sorted by
+    their training time, if they state it.
     """
     known = [(path, policy, _marks(policy)) for path, policy in zip(files, policies, strict=True)]
     heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")
@@ -458,7 +455,7 @@ def _follow_all(
 
 
 def _marks(policy: ForeignPolicy) -> dict[str, float]:
-    """Return the seconds and iterations of training from the file's metadata, as far as they are numbers."""
+    """Return the training's seconds (`wall_s`) and `iterations` from the file's metadata, without those that it lacks."""
     found = {}
     for name in ("wall_s", "iterations"):
         try:

@@ -35,9 +35,9 @@ MEGABYTES = 5.0
 def export(args: argparse.Namespace) -> int:
     """Export every checkpoint of a run: `legged export go1_flat`.
 
-    Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. Their metadata
-    hold the iteration and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the
-    first policy that walks. `legged play` exports the last checkpoint alone.
+    Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. The files
+    state the iteration, and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the
+    first of these policies that walks. `legged play` exports only the last checkpoint.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:
@@ -50,7 +50,7 @@ def export(args: argparse.Namespace) -> int:
         raise ConfigError(f"POLICY: {relative(policy.folder)} has no checkpoints of a training")
     folder = args.out or policy.output("export") / exporting.EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
-    # The C engine needs no compiler, and one robot is enough: nothing is simulated.
+    # Nothing is simulated, so the task is built as fast as possible: one robot, and no kernels to compile.
     calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
     changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
     task, act = restore(policy, changes, device, graph=False)

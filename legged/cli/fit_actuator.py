@@ -18,26 +18,26 @@ from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 
 UPDATES = {"mlp": 2000, "lstm": 3000}
-"""Default number of updates of a network."""
+"""Kind of network -> default number of training updates."""
 HIDDEN = {"mlp": (32, 32, 32), "lstm": (8, 8)}
 MEASURED = "#000000"
 COLORS = {"ideal PD": "#E69F00", "parametric": "#0072B2", "network": "#D55E00"}
 """Colours of the fits, from the palette of Okabe and Ito."""
 SHOWN_S = 2.0
-"""Time range of the picture [s]."""
+"""Length of the time axis in the picture [s]."""
 POINTS = 4000
-"""Number of measurements in the plot of torque over speed."""
+"""Largest number of measurements in the plot of torque over speed."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Prediction of the torques of a log by one model."""
+    """The torques that one model predicts for a log."""
 
     name: str
     log: ActuatorLog
-    """Log at the time step of the model."""
+    """The log, sampled at the time step of the model."""
     torque: np.ndarray
-    """(T, D) [N m]."""
+    """Predicted torques (T, D) [N m]."""
 
 
 @sub_command(
@@ -45,28 +45,28 @@ class Fit:
     "legged fit-actuator log.npz --joints HFE,KFE --kind lstm --dt 0.005 --out fits/legs",
     arguments=(
         argument("log", metavar="LOG", type=Path, help="the log, an .npz file"),
-        argument("--out", type=Path, default=Path("actuator"), help="folder that is written"),
-        argument("--joints", default="", help="parts of the names of the joints to fit; all joints by default"),
+        argument("--out", type=Path, default=Path("actuator"), help="folder for the files; actuator by default"),
+        argument("--joints", default="", help="fit only joints whose names contain one of these texts, e.g. HFE,KFE"),
         argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default"),
-        argument("--hidden", help="units of the network's layers; 32,32,32 by default, 8,8 for an lstm"),
-        argument("--samples", type=int, default=3, help="moments in the input of an mlp; 3 by default"),
-        argument("--spacing", type=float, default=0.01, help="time between the moments of an mlp [s]; 0.01 by default"),
+        argument("--hidden", help="units of the hidden layers; 32,32,32 by default, 8,8 for an lstm"),
+        argument("--samples", type=int, default=3, help="number of time steps in the input of an mlp; 3 by default"),
+        argument("--spacing", type=float, default=0.01, help="time between the time steps of --samples [s]; 0.01 by default"),
         argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default"),
-        argument("--updates", type=int, help="updates of the network; 2000 by default, 3000 for an lstm"),
+        argument("--updates", type=int, help="number of training updates; 2000 by default, 3000 for an lstm"),
         argument("--longest-delay", type=float, default=0.05, help="longest delay that is tried [s]; 0.05 by default"),
-        argument("--seed", type=int, default=1, help="seed of the network's first weights"),
+        argument("--seed", type=int, default=1, help="seed of the network's training"),
     ),
 )
 def fit_actuator(args: argparse.Namespace) -> int:
     """Fit a motor model to a log of a real motor: `legged fit-actuator log.npz --out fits/knee --joints KFE`.
 
-    The log has the arrays joint_names (D,), target, position, velocity and torque (T, D) in rad, rad/s and N m, and dt [s] or
-    time (T,). The arrays run (T,), stiffness, damping and torque_limit may be added if they are known. Sample at 200 Hz or
-    more: motion between two samples can't be learned.
+    The log must have these arrays: joint_names (D,); target, position, velocity and torque (T, D) in rad, rad/s and N m; and
+    either dt [s] or time (T,). It may also have run (T,), the number of each sample's run, and the motors' stiffness, damping
+    and torque_limit. Sample at 200 Hz or more: motion between two samples can't be learned.
 
     Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are tested
-    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (a section control.actuator with the
-    parts), network.npz (for control.actuator.network), fit.json and fit.png.
+    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (the drive as a section
+    control.actuator), network.npz (for control.actuator.network), fit.json and fit.png.
     """
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
     updates = UPDATES[args.kind] if args.updates is None else args.updates
@@ -90,7 +90,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
     _tell(log)
     drive = fit_drive(log, args.longest_delay)
     _tell_drive(drive, log)
-    from legged.fitting.training import predict, train_network  # slow to import: wrong logs fail before
+    from legged.fitting.training import predict, train_network  # imported late, because the import takes long
 
     weights = train_network(at_steps, args.kind, hidden, args.samples, spacing, updates, args.seed)
     fits = [Fit("parametric", log, drive.predict(log)), Fit("network", at_steps, predict(weights, at_steps))]
@@ -103,7 +103,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
     for name, of in judged.items():
         print(f"  {name:10}  RMSE {of['rmse']:.3g} N m, largest {of['largest']:.3g} N m, explained {of['explained']:.2%}")
     make_folder(args.out)
-    told = "# Fitted by legged fit-actuator: copy it into the YAML of a task\n"
+    told = "# Fitted by legged fit-actuator: copy this section into the YAML file of a task\n"
     section = dump({"control": control_section(at_steps, drive)}, sort_keys=False, default_flow_style=None, width=120)
     write_text(args.out / "actuator.yaml", told + section)
     numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
@@ -116,7 +116,6 @@ def fit_actuator(args: argparse.Namespace) -> int:
 
 
 def _widths(text: str) -> list[int]:
-    """Return the units of the layers."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() for part in parts):
         raise ConfigError(f"--hidden: expected numbers like 32,32,32, got '{text}'")
@@ -124,7 +123,7 @@ def _widths(text: str) -> list[int]:
 
 
 def _tell(log: ActuatorLog) -> None:
-    """Print the contents of the log."""
+    """Print length, sampling rate, number of runs and joints of a log."""
     seconds, held, runs = len(log.run) * log.dt, float(log.held_out.mean()), len(np.unique(log.run))
     names = ", ".join(log.joint_names[:4]) + (", ..." if len(log.joint_names) > 4 else "")
     sampled = f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}"
@@ -132,25 +131,25 @@ def _tell(log: ActuatorLog) -> None:
 
 
 def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
-    """Print the fitted parameters, and those that the log does not determine."""
+    """Print the fitted parameters, and say which parameters the log does not determine."""
     given = "given" if log.has_gains else "fitted"
     print(f"gains: {drive.stiffness:.4g} N m/rad, {drive.damping:.4g} N m s/rad ({given})")
     print(f"delay: {1e3 * drive.delay:.3g} ms")
     if np.isfinite(drive.stall_torque):
-        print(f"motor: {drive.stall_torque:.4g} N m at rest, none at {drive.no_load_speed:.4g} rad/s")
+        print(f"motor: {drive.stall_torque:.4g} N m at rest, 0 N m at {drive.no_load_speed:.4g} rad/s")
     else:
-        print("motor: its torque-speed line is not reached in the log; the effort limit stays")
+        print("motor: the log never reaches a torque-speed limit, so the robot's torque limit stays in use")
     viscous = f"viscous {drive.viscous:.3g} N m s/rad" if log.has_gains else "viscous friction is part of the damping"
     if drive.breakaway == drive.coulomb:
-        dry = f"{drive.coulomb:.3g} N m (the log shows no more to break away)"
+        dry = f"{drive.coulomb:.3g} N m (the log shows no higher breakaway torque)"
     else:
         dry = f"{drive.breakaway:.3g} N m to break away, {drive.coulomb:.3g} N m beyond {drive.stribeck_velocity:.2g} rad/s"
     print(f"friction: {dry}, {viscous}")
 
 
 def errors(fit: Fit) -> dict[str, float]:
-    """Return the root mean squared error and the largest error on held-out samples [N m], and the explained share of the
-    variance of the measured torques.
+    """Return figures of a fit on held-out samples: `rmse` and `largest`, the root mean squared and the largest error [N m],
+    and `explained`, the share of the measured torques' variance that the fit explains.
     """
     measured = fit.log.torque[fit.log.held_out]
     wrong = fit.torque[fit.log.held_out] - measured
@@ -159,8 +158,8 @@ def errors(fit: Fit) -> dict[str, float]:
 
 
 def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
-    """Return the section `control` for a fitted drive and the joints of a log with the physics' time step. It includes the
-    gains if they were fitted, that is, if the log does not state them.
+    """Return the section `control` of a task with a fitted drive. `log` has the joints' names, and the physics' time step as
+    `dt`. Gains are included if the log does not state them, because they were then fitted.
     """
 
     def named(**values: float) -> dict[str, dict[str, float]]:
@@ -178,7 +177,7 @@ def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
 
 
 def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
-    """Write a picture: torques over time and errors of each fit on held-out samples, and torque over speed.
+    """Draw three plots: torques over time and the errors of all fits, both on held-out samples, and torque over speed.
 
     Raises:
         RunError: the file cannot be written.
@@ -213,7 +212,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
 
 
 def _shown(log: ActuatorLog) -> np.ndarray:
-    """Return the indices of the held-out samples of one run within `SHOWN_S` of the first one."""
+    """Return the indices of held-out samples: the first one, and those of its run in the next `SHOWN_S`."""
     held = log.held_out
     start = int(np.flatnonzero(held)[0])
     rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))

@@ -20,7 +20,7 @@ from legged.process.paths import data_folder
 def list_(args: argparse.Namespace) -> int:
     """List tasks and robots of this installation: `legged list`.
 
-    The descriptions are the comments in the files, so that nothing is built.
+    The descriptions are comments in the files of tasks and robots; nothing is built.
     """
     if args.what != "robots":
         print_rows("tasks, each for `legged train TASK`", tasks())
@@ -35,12 +35,12 @@ def tasks() -> dict[str, str]:
 
 
 def robots() -> dict[str, str]:
-    """Return robot -> the model that its robot.yaml names in its first line; empty without such a comment."""
+    """Return robot -> the name of its model, from the comment at the head of its robot.yaml; empty without a comment."""
     files = sorted((data_folder("resources") / "robots").glob("*/robot.yaml"))
     return {path.parent.name: _comment(path).partition(": ")[0].partition(". ")[0] for path in files}
 
 
 def _comment(path: Path) -> str:
-    """Return the comment at the head of a YAML file, without line ends."""
+    """Return the comment at the head of a YAML file, as one line."""
     lines = takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
     return " ".join(line.lstrip("# ") for line in lines)

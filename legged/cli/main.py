@@ -19,21 +19,21 @@ SECTIONS = {
     "on a robot": ("export", "deploy"),
     "this machine": ("warmup", "completion"),
 }
-"""Heading of the help -> the first words of its commands."""
+"""Heading in the help -> first words of the commands under it."""
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "train": ("legged.cli.train:train", "train a policy"),
     "play": ("legged.cli.play:play", "film a policy, measure it and export it"),
     "watch": ("legged.cli.watch:watch", "watch a policy in the browser, also while it is trained"),
-    "evaluate": ("legged.cli.evaluate:evaluate", "measure a policy: what fits its task"),
+    "evaluate": ("legged.cli.evaluate:evaluate", "measure a policy; its task decides what is measured"),
     "evaluate grid": ("legged.cli.evaluate:grid", "velocity errors over a grid of commands"),
     "evaluate terrain": ("legged.cli.evaluate:terrain", "success against the size of stairs, gaps, slopes, ..."),
-    "evaluate stress": ("legged.cli.evaluate:stress", "disturbances, unknown ground and other solver settings"),
-    "evaluate checkpoints": ("legged.cli.evaluate:checkpoints", "the first checkpoint of a run that walks"),
+    "evaluate stress": ("legged.cli.evaluate:stress", "success under disturbances and on unknown ground"),
+    "evaluate checkpoints": ("legged.cli.evaluate:checkpoints", "search a run for its first checkpoint that walks"),
     "evaluate episodes": ("legged.cli.evaluate:episodes", "returns and lengths of episodes, for tasks without commands"),
     "evaluate gymnasium": ("legged.cli.evaluate:gymnasium", "returns in Gymnasium's own environment"),
     "evaluate onnx": ("legged.cli.evaluate:onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
-    "runs": ("legged.cli.runs:runs", "all runs in one table (as `runs table`)"),
+    "runs": ("legged.cli.runs:runs", "all runs in one table (the same as `runs table`)"),
     "runs table": ("legged.cli.runs:runs", "all runs in one table"),
     "runs report": ("legged.cli.runs:report", "a page about one run: settings, curves, evaluations, film"),
     "runs compare": ("legged.cli.runs:compare", "settings, curves and evaluations of several runs side by side"),
@@ -47,7 +47,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "sweep report": ("legged.cli.sweep:report", "table and figures of a sweep"),
     "benchmark step": ("legged.cli.benchmark:step", "times of a control step and of training iterations"),
     "benchmark scale": ("legged.cli.benchmark:scale", "speed against the number of robots"),
-    "benchmark ground": ("legged.cli.benchmark:ground", "speed on a plane, on terrain and with general contacts"),
+    "benchmark ground": ("legged.cli.benchmark:ground", "speed on a plane, and on terrain with two colliders"),
     "benchmark startup": ("legged.cli.benchmark:startup", "how long a training takes to begin"),
     "robot add": ("legged.cli.robot:add", "turn a URDF or MJCF file into a robot and a task"),
     "robot show": ("legged.cli.robot:show", "joints, limits, gains and feet of a robot"),
@@ -61,11 +61,11 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "completion": ("legged.cli.completion:completion", "print a completion script for a shell"),
     "list": ("legged.cli.list:list_", "list tasks and robots"),
 }
-"""Words of a command -> its module with the name of its function, and a summary."""
+"""Words of a command -> `module:function`, and a summary."""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command that the first words of `argv` name, by default those of this process; return its exit code."""
+    """Run the command that `argv`, by default the arguments of this process, names first; return its exit code."""
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:
@@ -84,7 +84,7 @@ def load(name: str) -> SubCommand:
 
 
 def split(words: list[str]) -> tuple[str | None, list[str]]:
-    """Return the command that the first words name, None if they name none, and the words after it."""
+    """Return the command that the words begin with, or None, and the remaining words."""
     for count in (2, 1):
         name = " ".join(words[:count])
         if len(words) >= count and name in COMMANDS:
@@ -94,10 +94,10 @@ def split(words: list[str]) -> tuple[str | None, list[str]]:
 
 @contextmanager
 def hint_at_sub_command(group: str, words: Sequence[str]) -> Iterator[None]:
-    """Add the nearest sub-command of `group` to an error about one of `words`, because the word may be a misspelt one.
+    """Add a hint to an error whose text contains one of `words`: a sub-command of `group` that is spelt almost like it.
 
     Raises:
-        ConfigError: the error, with the hint.
+        ConfigError: the error of the block, with the hint if there is one.
     """
     try:
         yield
@@ -115,7 +115,7 @@ def sub_commands(group: str) -> list[str]:
 
 
 def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
-    """Print a title and two columns, names and texts; the first column has at least `width` letters."""
+    """Print a title, and a column of names next to one of texts. The first is at least `width` characters wide."""
     width = max([width, *map(len, rows)])
     print(f"{title}:")
     for name, summary in rows.items():

@@ -29,8 +29,8 @@ FIRST = ("rewards", "observations", "robot")
     "legged migrate legged_gym/envs/__init__.py --task go2 --out tasks --run",
     arguments=(
         argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes"),
-        argument("--run", action="store_true", help="run the file and the modules that it imports"),
-        argument("--task", help="class or registered task to migrate; if there is only one, a new name for it"),
+        argument("--run", action="store_true", help="allow the command to run FILE and the modules that it imports"),
+        argument("--task", help="class or registered task to migrate; if there is only one, a new name for the task"),
         argument("--robot", help="robot under resources/robots/, or a folder; by default the robot with the asset's name"),
         argument("--out", type=Path, default=Path("."), help="folder for the files that are written"),
         argument("--force", action="store_true", help="write over existing files"),
@@ -39,10 +39,10 @@ FIRST = ("rewards", "observations", "robot")
 def migrate(args: argparse.Namespace) -> int:
     """Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
 
-    The command runs the file, and the modules that it imports, in a child process, as your training does. Isaac Gym and
-    similar libraries need not be installed. From the live classes it writes <task>.yaml with the settings that differ from
-    the defaults, and robots/<task>/robot.yaml if the robot's pose or contacts differ. It names the rewards whose formulas are
-    the fork's own, and lists every setting without a counterpart, with file and line.
+    The command imports the file in a child process; Isaac Gym and similar libraries need not be installed. It then reads the
+    values of the classes, and writes the settings that differ from the defaults to <task>.yaml. If the robot's pose or
+    contacts differ, it also writes robots/<task>/robot.yaml. It names the rewards with formulas of the fork's own, and every
+    setting without a counterpart, with file and line.
     """
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
@@ -71,8 +71,8 @@ def migrate(args: argparse.Namespace) -> int:
     head = [f"Written by legged migrate from {relative(args.file)}, {fork.described}."]
     head += [f"{subject}: {line}" for subject, lines in result.notes.items() for line in lines]
     if robot is None:
-        result.note("robot", f"it does not exist here yet: {asset_of(result) or 'the configuration names no file'}")
-        head += ["The robot of this task does not exist here yet. The configuration gives these entries of its robot.yaml:"]
+        result.note("robot", f"this package does not have it yet: {asset_of(result) or 'the configuration names no file'}")
+        head += ["This package does not have the task's robot yet. The configuration gives these entries of its robot.yaml:"]
         head += [f"  {line}" for line in robot_yaml([], entries).splitlines()]
     minor = [f"without effect on a task: {', '.join(result.minor)}"] if result.minor else []
     write_text(path, task_yaml(head, result.settings, result.comments, [*map(str, result.lost), *minor]))
@@ -81,14 +81,14 @@ def migrate(args: argparse.Namespace) -> int:
 
 
 def _task_name(name: str) -> str:
-    """Return a task name that this package does not use."""
+    """Return the name of the new task: `name`, after my_ if this package has a task `name`."""
     if not is_plain_name(name):
         raise ConfigError(f"--task: the name of a task must be {PLAIN}; got {shown(name)}")
     return f"my_{name}" if exists(data_folder("cfg") / f"{name}.yaml") else name
 
 
 def _robot(asked: str | None, result: Translation) -> Robot | None:
-    """Return the robot `asked`, or the robot of this package with the name of the asset."""
+    """Return the robot `asked`, or by default the robot of this package that has the asset's name, if there is one."""
     if asked is not None:
         return load_robot(asked, "--robot")
     robots = data_folder("resources") / "robots"
@@ -106,15 +106,15 @@ def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Tr
 
 
 def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Path) -> str:
-    """Return a robot.yaml that uses another robot's model, with the pose and contacts of the configuration."""
+    """Return the text of the robot.yaml of `robot` with the configuration's `entries`; the model stays where it is."""
     data = read_yaml(robot.folder / "robot.yaml") | entries
     data["model"] = os.path.relpath(robot.model_path, folder.resolve())
     changed = ", ".join(entries)
-    return robot_yaml([f"The model of {robot.name} as {relative(source)} has it: {changed} are that file's."], data)
+    return robot_yaml([f"The robot {robot.name}, with these entries from {relative(source)}: {changed}."], data)
 
 
 def _asset(file: Path, result: Translation) -> str:
-    """Return the path of the robot's file if it exists in a folder above the configuration, else the configuration's path."""
+    """Return the path of the robot's file, found in a folder above the configuration, else as the configuration has it."""
     asset = asset_of(result)
     found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
     return next(found, asset or "FILE.urdf")
@@ -134,7 +134,7 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Ro
             print(f"not mapped: {entry}{f'; also {also}' if also else ''}")
     if not all(entry.reason for entry in result.lost):
         plain = ", ".join(entry.setting for entry in result.lost if not entry.reason)
-        print(f"not mapped, without counterpart (places are in {path.name}): {plain}")
+        print(f"not mapped, without counterpart (file and line are in {path.name}): {plain}")
     if result.minor:
         print(
             f"not mapped, without effect: {len(result.minor)} settings of the simulator, of drawing and of the command line"
@@ -149,6 +149,6 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Ro
     try:
         task_config(register_file(str(path)))
     except ConfigError as error:
-        print(f"it does not load yet: {error}")
+        print(f"the task does not load yet: {error}")
         return
     print(f"show the whole configuration: legged train {relative(path)} --show")

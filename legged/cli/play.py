@@ -42,7 +42,7 @@ ROOM_MB = 24.0
 MOST_SHOWN = 9
 """Largest number of robots in the picture on a plane."""
 SHOWN_ON_A_PLANE = 4
-"""Default number of robots."""
+"""Default number of robots on a plane."""
 
 
 @sub_command(
@@ -53,7 +53,7 @@ SHOWN_ON_A_PLANE = 4
         *TILES,
         argument("--headless", action="store_true", help="open no window, even if there is a display"),
         argument("--gif", action="store_true", help="also write a GIF"),
-        argument("--no-video", action="store_true", help="export and measure only"),
+        argument("--no-video", action="store_true", help="film nothing; only export and measure"),
         argument("--out", type=Path, help="folder for video and exported/; the run folder by default"),
     ),
 )
@@ -76,7 +76,7 @@ def play(args: argparse.Namespace) -> int:
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
-                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose, because the model has the ground")
+                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose: its ground is part of its model")
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
@@ -112,7 +112,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _named(args: argparse.Namespace) -> str:
-    """Return the name of the policy: POLICY, or the run of this task that legged_gym's options choose."""
+    """Return the name of the policy: POLICY, or the run that --load-run or --experiment-name chooses for the task POLICY."""
     if args.load_run is None and args.experiment_name is None:
         return str(args.policy)
     flags = [("train.runner.experiment_name", args.experiment_name)] if args.experiment_name else []
@@ -126,7 +126,7 @@ def _named(args: argparse.Namespace) -> str:
 def _on_ground(
     args: argparse.Namespace, policy: TrainedPolicy, asked: list[tuple[str, Any]], device: torch.device, folder: Path
 ) -> tuple[Playground | None, LeggedRobot, Actor]:
-    """Build a task of legged robots, on tiles if the command line chooses terrain."""
+    """Build a task of legged robots, on a playground or a plane; return the playground or None, the task and the policy."""
     wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
     playground = Playground.of(wanted, args.terrain, args.difficulty)
     count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE

@@ -28,9 +28,9 @@ from legged.robots.importing.tree import Tree
 from legged.robots.robot import Robot, load_robot
 
 SINKS, STANDS = 0.8, 0.85
-"""A robot sinks whose base comes to rest below the first share of its height; raised gains reach the second one."""
+"""If the base sinks below the first share of its default height, gains are raised until the base stays above the second."""
 RAISED = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Factors on the rule's P gains that are tried; D gains grow with their roots."""
+"""Factors to try on the P gains of the rule. D gains are multiplied by the square root of the factor."""
 ROOM_MB = 100.0
 """Disk space for the files [MiB]."""
 
@@ -41,12 +41,10 @@ ROOM_MB = 100.0
     arguments=(
         argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
         argument("--name", help="name of the robot; by default the name of the file"),
-        argument("--out", type=Path, help="folder for the robot's folder and its task; by default the folders of this clone"),
-        argument("--extends", metavar="TASK", help="task to extend; one of base/ by default"),
-        argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold; may be repeated"),
-        argument(
-            "--packages", type=Path, action="append", default=[], help="another folder in which to search for package://"
-        ),
+        argument("--out", type=Path, help="folder for the robot folder and the task; by default resources/robots and cfg"),
+        argument("--extends", metavar="TASK", help="task that the new task extends; one of base/ by default"),
+        argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold still; may be repeated"),
+        argument("--packages", type=Path, action="append", default=[], help="folder in which to look for package:// files"),
         argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; by default from the file, or from a rule"),
         argument("--damping", type=float, help="D gain of all joints [N m s/rad]"),
         argument("--force", action="store_true", help="write over a robot with this name"),
@@ -97,7 +95,7 @@ def add(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _nothing_left(folder: Path, task: Path) -> Iterator[None]:
-    """Remove what was written into a new robot folder, and the task's file, if an error follows."""
+    """If the block raises a ConfigError, remove the robot folder and the task's file, unless they existed before."""
     new = [path for path in (folder, task, folder.parent) if not exists(path)]
     try:
         yield
@@ -108,8 +106,8 @@ def _nothing_left(folder: Path, task: Path) -> Iterator[None]:
 
 
 def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
-    """Test whether a robot stands by itself under its gains, and report the result. If it does not and a rule has chosen the
-    gains, raise them as far as an explicit control law is stable. Return True if a line was added.
+    """Test whether a robot stands under its gains. If it sinks, say so in the report, and return True. If a rule has chosen
+    the gains, also raise them until the robot stands, but not beyond the stability limit of an explicit control law.
     """
     height = height_under_gains(robot, robot.stiffness, robot.damping)
     if height >= SINKS * robot.height:
@@ -124,9 +122,9 @@ def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
         higher = height_under_gains(robot, p, d)
         if higher >= STANDS * robot.height:
             guesses.stiffness, guesses.damping = raised
-            tree.say(f"guess: gains are {factor:g} times the rule's, with which {sinks}; with these to {higher:.3g} m")
+            tree.say(f"guess: gains are {factor:g} times the rule's. With the rule's {sinks}, with these to {higher:.3g} m")
             return True
-    tree.say(f"{sinks}: look at the gains, at the inertia of rotors (armature), or give --stiffness and --damping")
+    tree.say(f"{sinks}: check the gains and the rotors' inertia (armature), or give --stiffness and --damping")
     return True
 
 
@@ -141,7 +139,7 @@ def _gains(args: argparse.Namespace) -> tuple[float, float] | None:
 
 
 def _source(given: str) -> tuple[Path, str, str]:
-    """Return the file, its name in PROVENANCE.md, and its licence as far as it is known."""
+    """Return the file that SOURCE names, and two texts for PROVENANCE.md: the origin of the file, and its licence."""
     if given.startswith(PREFIX):
         path, licence = menagerie_model(given.removeprefix(PREFIX))
         return path, f"MuJoCo Menagerie, {given.removeprefix(PREFIX)}/{path.name}", licence
@@ -153,15 +151,15 @@ def _source(given: str) -> tuple[Path, str, str]:
 
 
 def _check_apart(source: Path, folder: Path) -> None:
-    """Check that a source file is not in the folder that is written, where it could be overwritten."""
+    """Check that a source file is not in the robot's new folder, because it could be overwritten there."""
     if source.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(
-            f"{relative(source)}: is in {relative(folder)}, which would be written over; give another --name or --out"
+            f"{relative(source)}: the new robot would overwrite its folder {relative(folder)}; give another --name or --out"
         )
 
 
 def _check_task(name: str, beside: Path) -> None:
-    """Check that the task `name` exists, which the new task extends. `beside` is the file of the new task."""
+    """Check that the task `name` exists. The new task, which has the file `beside`, extends it."""
     folders = (data_folder("cfg"), beside.parent)
     if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
         names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
@@ -169,8 +167,8 @@ def _check_task(name: str, beside: Path) -> None:
 
 
 def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
-    """Return the robot's folder and the task's file. If the extended task is called `..._flat` or `..._real`, the new name
-    has the same ending, else it is the robot's name, as in cfg/. Without `extends` the ending is `_flat`.
+    """Return the robot's folder and the task's file. The task has the robot's name, with the ending `_flat` or `_real` if the
+    extended task has this ending. Without `extends` the ending is `_flat`.
     """
     like = "_flat" if extends is None else extends.removesuffix(".yaml")
     file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
@@ -207,7 +205,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
 def show(args: argparse.Namespace) -> int:
     """Print joints, limits, gains and feet of a robot: `legged robot show go2`.
 
-    The numbers come from the robot's folder. Tasks with this robot use them unless their settings change them.
+    The numbers come from the robot's folder. A task with this robot uses them unless its settings change them.
     """
     robot = load_robot(args.robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")

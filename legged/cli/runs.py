@@ -40,17 +40,17 @@ from legged.process.startup import command_of_ours
 SIDE = 320
 """Width and height of the film [pixels]."""
 LONGEST_FILM_S = 900.0
-"""Time limit for filming [s]. A process that takes longer hangs, and is ended."""
+"""Time limit for filming [s]. A process that takes longer is taken to hang, and is ended."""
 LONGEST_NOTE = 1000
 MOST_COMPARED = 8
-"""Largest number of runs that are compared, because there are this many colours."""
+"""Largest number of runs in a comparison, because each run has a colour and there are eight."""
 PICTURE = "learning_curve.png"
-RUNS = (argument("runs", nargs="+", metavar="RUN", help="runs or their folders, or tasks (for their newest runs)"), IMPORT)
-"""The positional argument RUN, of one or more runs, and --import."""
+RUNS = (argument("runs", nargs="+", metavar="RUN", help="a run, its folder, or a task (its newest run)"), IMPORT)
+"""The positional argument RUN, which takes one or more runs, and the option --import."""
 
 
 def _folders_of(args: argparse.Namespace) -> list[Path]:
-    """Return the folders of the runs on a command line, after the import of its user-defined tasks.
+    """Register the user-defined tasks of --import, and return the folders of the runs on the command line.
 
     Raises:
         ConfigError: there is no such run or module.
@@ -64,7 +64,7 @@ def _folders_of(args: argparse.Namespace) -> list[Path]:
     "legged runs logs/anymal_c_flat logs/go2_flat --seeds-share",
     arguments=(
         argument("folders", nargs="*", type=Path, metavar="FOLDER", help=f"folders of runs; {LOGS}/ by default"),
-        argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; {LOGS}/, or the first one given"),
+        argument("--out", type=Path, metavar="FOLDER", help=f"folder for the pages; by default the first FOLDER, or {LOGS}/"),
         argument("--seeds-share", action="store_true", help="one row of means for runs that differ in their seed only"),
         IMPORT,
     ),
@@ -72,12 +72,12 @@ def _folders_of(args: argparse.Namespace) -> list[Path]:
 def runs(args: argparse.Namespace) -> int:
     """List all runs in one table: `legged runs`.
 
-    Every run in logs/, or in the folders given, becomes a row of experiments.html and experiments.md, newest first. On the
-    page a click on a column sorts and a field filters. `--seeds-share` makes one row of the seeds of a training.
+    Every run in logs/, or in the folders given, becomes a row of experiments.html and experiments.md, newest first. The
+    page can be sorted and filtered. With `--seeds-share`, runs that differ only in their seed share a row of means.
     """
     import_given(args)
     folder: Path = args.out or (args.folders[0] if args.folders else LOGS)
-    if exists(folder) or args.out is not None:  # `folders_in` reports a missing folder of runs
+    if exists(folder) or args.out is not None:  # a FOLDER that does not exist is reported by `folders_in`
         ready_to_write(folder, 4.0)
     with hint_at_sub_command("runs", list(map(str, args.folders))):
         found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}
@@ -104,13 +104,12 @@ def runs(args: argparse.Namespace) -> int:
 def report(args: argparse.Namespace) -> int:
     """Write a page about a run: `legged runs report anymal_c_flat`.
 
-    report.html is written into the run's folder: settings, curves, evaluations and the film on one page that needs no
-    network. report.md and its pictures lie beside it. A training writes its report when it ends; this command writes it
-    again, after an evaluation or for a run that was killed. `--film` films the policy first; `--note` keeps a sentence about
-    the run.
+    report.html in the run's folder shows settings, curves, evaluations and the film, and needs no internet. report.md has the
+    same contents. A training writes both when it ends. This command writes them again, e.g. after an evaluation, or for a run
+    that was killed. `--film` films the policy first; `--note` stores a sentence about the run.
     """
     if args.checkpoint is not None and not args.film:
-        raise ConfigError(f"--checkpoint: {args.checkpoint}: chooses the policy to film; add --film")
+        raise ConfigError(f"--checkpoint: {args.checkpoint}: has no effect without --film; add --film")
     folders = _folders_of(args)
     note = " ".join((args.note or "").split())
     if args.note is not None and not 0 < len(note) <= LONGEST_NOTE:
@@ -120,7 +119,7 @@ def report(args: argparse.Namespace) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            if command_of_ours():  # a drawing library may hang, and no exception would end that
+            if command_of_ours():  # a drawing library may hang, and then only this ends the process
                 faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
             faulthandler.cancel_dump_traceback_later()
@@ -135,7 +134,7 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
         cfg = run_config(folder)
         if not isinstance(cfg, LeggedConfig):
             command = command_on(read_record(folder), "play")
-            return f"'{cfg.task}' has no velocity commands; {command} --gif makes one"
+            return f"'{cfg.task}' has no velocity commands; {command} --gif makes a film"
         torch.set_num_threads(1)
         pictures = film(TrainedPolicy(cfg, find_checkpoint(folder, checkpoint)), SIDE)
         if not exists(folder / CONFIG_FILE):
@@ -157,8 +156,8 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
 def compare(args: argparse.Namespace) -> int:
     """Show several runs side by side: `legged runs compare A B`.
 
-    comparison.html and .md show which settings differ, the learning curves over each other, and the evaluations with
-    confidence intervals. The first run is the reference.
+    comparison.html and .md show which settings differ, the learning curves in common plots, and the evaluations with
+    confidence intervals. Every run is compared with the first one.
     """
     if not 2 <= len(args.runs) <= MOST_COMPARED:
         raise ConfigError(f"RUN: expected 2 to {MOST_COMPARED} runs, got {len(args.runs)}")
@@ -187,8 +186,8 @@ def compare(args: argparse.Namespace) -> int:
 def evaluations(args: argparse.Namespace) -> int:
     """Show evaluation files side by side: `legged runs evaluations logs/anymal_c/RUN logs/anymal_c/RUN`.
 
-    Evaluations of one task in one engine count as its seeds: the tables give their mean and the largest deviation from it,
-    the picture their mean and range. Evaluations with different changed settings, or on different grids, get separate rows.
+    Evaluations of the same task, engine, overrides and grid share a row, as they may differ in the seed. Tables show the
+    row's mean and the largest deviation from it, and the picture shows mean and range.
     """
     if args.out:
         ready_to_write(args.out)
@@ -200,7 +199,7 @@ def evaluations(args: argparse.Namespace) -> int:
     for key, seeds in grouped(results).items():
         of_episodes = {"episodes" in result for result in seeds}
         if len(of_episodes) > 1:
-            told = "some evaluations measure commands, others episodes; compare them separately"
+            told = "some files hold errors of commands, others returns of episodes; compare them separately"
             raise ConfigError(f"{key[0]} in {key[1]}: {told}")
         (episodes if of_episodes.pop() else following)[key] = seeds
     tracked = {key: seeds for key, seeds in following.items() if any(map(has_tracking, seeds))}
@@ -211,7 +210,7 @@ def evaluations(args: argparse.Namespace) -> int:
             console.print(table(groups))
     if args.out:
         if not with_success:
-            raise ConfigError("--out: draws success against difficulty, which none of the evaluations measured")
+            raise ConfigError("--out: there is nothing to draw, because no file holds success on terrain; leave --out out")
         make_folder(args.out)
         draw_comparison(with_success, args.out / "success.png")
         print(f"written: {relative(args.out / 'success.png')}")
@@ -229,10 +228,9 @@ def evaluations(args: argparse.Namespace) -> int:
 def curves(args: argparse.Namespace) -> int:
     """Draw learning curves of runs as a picture: `legged runs curves anymal_c_flat`.
 
-    learning_curve.png shows returns, errors, falls and metrics over iterations, one line for each run, read from the
-    TensorBoard files. An axis on top shows the time, unless the runs differ by more than 5 % in the time of an iteration. For
-    runs on terrain the picture also shows the mean level of each type, and the shares of episodes after which robots moved up
-    and down.
+    learning_curve.png shows returns, errors, falls and metrics over iterations, one line for each run. An axis on top shows
+    the time, unless the runs differ by more than 5 % in the time of an iteration. For runs on terrain the picture also shows
+    the mean level of each type, and the shares of episodes after which robots moved to a higher and to a lower level.
     """
     folders = _folders_of(args)
     ready_to_write(args.out)

@@ -1,4 +1,4 @@
-"""`legged sweep`: search settings by many trainings, and report on them."""
+"""`legged sweep`: search for good settings by many trainings, and report on them."""
 
 import argparse
 import gc
@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 TELL_S = 1.0
 """Interval at which the trials of other processes are read [s]."""
 MOST_STARTS = 10
-"""Largest number of restarts of a worker whose process ends before the sweep does."""
+"""Largest number of times that a worker is started. A worker that a signal has killed is started again."""
 PRUNED = "ended early: other trials were better at that step"
 SIGNALLED = 128
-"""Exit codes from here on mean that a signal ended a training."""
+"""Exit code of a training that a signal ended, minus the signal's number."""
 MOST_FAILURES = 3
-"""Failed trials in a row after which a worker gives up."""
+"""Number of failed trials in a row after which a worker gives up."""
 
 
 SWEEP = (
     argument("file", metavar="FILE", help="YAML file of the sweep, or the name of one in cfg/sweeps"),
-    argument("--sim-device", help="cpu, cuda, or several devices with commas, which the jobs share"),
-    argument("--storage", help="URL of a database that several machines share, or journal:<file>"),
+    argument("--sim-device", help="cpu, cuda, or several GPUs for the jobs, e.g. cuda:0,cuda:1"),
+    argument("--storage", help="where trials are stored: URL of a database that machines can share, or journal:<file>"),
     IMPORT,
 )
 """Arguments that choose a sweep."""
@@ -82,12 +82,11 @@ def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, 
     ),
 )
 def run(args: argparse.Namespace) -> int:
-    """Search settings that learn better or sooner: `legged sweep run anymal_c_flat`.
+    """Search for settings with which a task is learned better or sooner: `legged sweep run anymal_c_flat`.
 
-    Optuna's TPE sampler draws the settings of each trial. A trial is an ordinary run in logs/<name of the sweep>; trials
-    that fall behind are ended early. A sweep that was stopped or killed continues. Several processes, GPUs and machines share
-    one sweep through its storage. At the end the folder gets table.md, best.yaml and figures, as `legged sweep report` makes
-    them.
+    Optuna's TPE sampler chooses the settings of each trial. A trial is one or more trainings in logs/<name of the sweep>;
+    trials that fall behind are ended early. Run the command again to continue a sweep that was stopped or killed. Several
+    processes, GPUs and machines can share a sweep through its storage. `legged sweep report` runs at the end.
     """
     if Ranks.now().several:
         raise ConfigError("sweep: run it without torchrun, because it starts its processes itself")
@@ -125,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -> list[int]:
-    """Run trials in several processes; return the signals that ended processes early."""
+    """Run trials in `jobs` worker processes; return the signals that this process received."""
     given, start, starts = trials.plan.given, time.perf_counter(), [0] * jobs
     pool = WorkerPool({Kind.TRAINING: jobs})
     told = {trial.number for trial in trials.finished}
@@ -166,7 +165,7 @@ class Stopped(Exception):
 
 
 class NoValue(Exception):
-    """Exception of a trial without a value, which counts as ended early; the text is the reason."""
+    """Exception of a trial without a value. The trial counts as ended early, and the text is the reason."""
 
 
 class Worker:
@@ -186,7 +185,7 @@ class Worker:
             while not self._stopped and os.getppid() == parent and (trial := self.trials.next()) is not None:
                 try:
                     self._make(trial)
-                except Stopped as signalled:  # during a training, the training handles signals
+                except Stopped as signalled:  # a training has its own signal handlers
                     self._stopped = True
                     in_trials.append(signalled.args[0])
         return [*stopped_by, *in_trials]
@@ -260,7 +259,7 @@ class Worker:
         until, plan, settings = self.plan.cfg.train.runner.max_iterations, self.plan, self.plan.settings(trial.params)
 
         def listen(found: Evaluated) -> str:
-            """Report the mean over the seeds so far; return a reason to end if others were better by this step."""
+            """Report the mean over the seeds so far to Optuna; return why to end the training, or an empty text to go on."""
             now = found.figures[plan.figure]
             if not math.isfinite(now):
                 return ""
@@ -269,7 +268,7 @@ class Worker:
             return PRUNED if found.iterations < until and trial.should_prune() else ""
 
         def prepare(runner: Runner) -> None:
-            assert runner.evaluations is not None, "the plan switches them on"
+            assert runner.evaluations is not None, "the plan switches evaluations on"
             runner.evaluations.listener = listen
             kept.append(runner)
 
@@ -302,7 +301,7 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
         return values[-1]
     if objective.take == "best":
         return min(values) if plan.minimize else max(values)
-    assert objective.target is not None, "the plan has seen to it"
+    assert objective.target is not None, "the plan checks that there is a target"
     for found in history:
         if reaches(figure, found.figures[figure], objective.target):
             return found.loop_s if objective.take == "time" else float(found.steps)
@@ -317,8 +316,8 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
 def report(args: argparse.Namespace) -> int:
     """Write table and figures of a sweep: `legged sweep report anymal_c_flat`.
 
-    table.md, best.yaml and figures of the trials that have ended are written into logs/<name of the sweep>, also while the
-    sweep runs.
+    table.md, best.yaml and figures of the trials that have ended are written into logs/<name of the sweep>. The sweep may
+    still be running.
     """
     plan, _ = _settle(args)
     print(*write_report(Trials(plan, args.storage or ""), args.module), sep="\n")

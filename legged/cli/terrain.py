@@ -31,8 +31,8 @@ from legged.terrain import Terrain, check_terrain, terrain_types
 def terrain(args: argparse.Namespace) -> int:
     """Draw a task's terrain: `legged terrain anymal_c`.
 
-    terrain_map.png shows the whole grid of tiles from above, terrain.png one tile of each type with a robot on it. `--types`
-    shows other types than the task's.
+    terrain_map.png shows the whole grid of tiles from above, terrain.png shows one tile of each type with a robot on it. With
+    `--types` both pictures show these types instead of the task's.
     """
     register_given(args, "task")
     if not 0.0 <= args.difficulty <= 1.0:
@@ -44,8 +44,8 @@ def terrain(args: argparse.Namespace) -> int:
     if args.types is None:
         if cfg.terrain.mesh_type == "plane":
             raise ConfigError(
-                f"{args.task}: has no terrain to show, because its ground is a plane (terrain.mesh_type); --types shows"
-                " types of your choice"
+                f"{args.task}: has no terrain to show, because its ground is a plane (terrain.mesh_type); name"
+                " types to show with --types"
             )
         check_terrain(cfg.terrain, cfg.origins)
         grid = Terrain.build(cfg.terrain, cfg.env.seed)
@@ -55,7 +55,7 @@ def terrain(args: argparse.Namespace) -> int:
         types = terrain_types("--types", args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
         check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
-        # The first column of the grid is the rightmost one in the picture.
+        # The map shows the first column of the grid on the right, so the order of the types is reversed.
         grid = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)
         levels = [f"{args.difficulty:g}"]
     make_folder(args.out)

@@ -69,11 +69,11 @@ ROOM_MB = 16.0
         argument("--transfer", metavar="POLICY", help="begin with the networks of another training, of any task"),
         argument("--teacher", metavar="POLICY", help="policy that a student imitates (train.distillation.teacher)"),
         argument("--run-name", help="text that is appended to the run folder's name"),
-        argument("--max-iterations", type=int, help="length of the whole training"),
+        argument("--max-iterations", type=int, help="iterations of the whole training, including those before --resume"),
         argument("--note", help="a sentence about this run, for its report and the table of all runs"),
         argument("--rl-device", help="device of the networks; that of the simulation by default"),
         argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)"),
-        argument("--headless", action="store_true", help="without effect; legged_gym has this option"),
+        argument("--headless", action="store_true", help="has no effect; accepted because legged_gym has it"),
         argument("--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"),
     ),
 )
@@ -148,17 +148,17 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
             training.close(folder, finished)
     if finished:
         return 0
-    # Without a signal to this process, its output was lost, or a signal stopped another process.
+    # If this process received no signal, its output was lost, or a signal stopped another process.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
 def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:
-    """Build the training loop, and print how the task is simulated and taught."""
+    """Build the training loop, and print facts about the engine, the robot and the teacher."""
     physics = task.physics
     if physics.why_c_engine:
-        print(f"C MuJoCo instead, which is faster here: {physics.why_c_engine}", flush=True)
+        print(f"C MuJoCo replaces mujoco-warp, because it is faster for this task: {physics.why_c_engine}", flush=True)
     if physics.why_library:
-        print(f"mujoco-warp's own launches: {physics.why_library}", flush=True)
+        print(f"uses mujoco-warp's own launches; reason: {physics.why_library}", flush=True)
     for line in task.robot.adaptations if physics.robot_state is not None else ():
         print(f"{task.robot.file.model}: {line}", flush=True)
     if teacher is not None:
@@ -169,11 +169,11 @@ def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, di
 
 
 def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespace) -> Teacher | None:
-    """Return the teacher of a task that imitates one: for a resumed training the teacher in its `checkpoint`, else the one in
-    the configuration.
+    """Return the teacher that a task imitates: for a resumed training the teacher in its `checkpoint`, else the one in the
+    configuration; None if the task learns from rewards.
 
     Raises:
-        ConfigError: the teacher is missing or does not fit, or one is named for a task that imitates none.
+        ConfigError: the teacher is missing or does not fit, or --teacher is given but the task learns from rewards.
     """
     if not learns_from_teacher(cfg):
         if args.teacher is not None:
@@ -204,8 +204,8 @@ class _Training:
         return evaluations
 
     def learn(self, display: Display | None) -> tuple[Path | None, bool]:
-        """Train into a new run folder; return the folder (None if another process has it), and True if the training
-        reached its end.
+        """Train, and write to a new run folder; return the folder (None in all processes but the first), and True if the
+        training reached its end.
 
         A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its
         times into the folder.
@@ -236,7 +236,7 @@ class _Training:
             discard_run(folder)
             if folder.is_dir():
                 said = "" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
-                # Writing fails on a full disk, and reading the name of a broken CUDA device fails.
+                # The disk may be full, and a broken CUDA device has no name.
                 with contextlib.suppress(RunError, RuntimeError):
                     write_timing(folder, self.timing(False, " ".join(said.split())[:500]))
                     self._report(folder, film=False)
@@ -286,7 +286,7 @@ class _Training:
     def _report(self, folder: Path, film: bool) -> None:
         """Write the report on a training that has ended, unless its configuration switches reports off."""
         if self.cfg.train.runner.report:
-            from legged.evaluation.reports.run_report import report_at_end  # imported late, because a start does not need it
+            from legged.evaluation.reports.run_report import report_at_end  # imported late; training does not need it
 
             # The process that makes the film needs --import to find the task.
             report_at_end(folder, given_import(self.args) if film and self.cfg.train.runner.film else None)
@@ -318,7 +318,7 @@ def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str
     newest = False
     if not cfg.train.runner.experiment_name:
         with contextlib.suppress(ConfigError, OSError):
-            newest = find_run(cfg, None) == folder  # False if another training of this task runs at the same time
+            newest = find_run(cfg, None) == folder  # another training of this task may have begun later
     if not newest:
         return shlex.join([*program("play"), *given_import(args), relative(folder)])
     module = ["--import", args.module] if args.module else []

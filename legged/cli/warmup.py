@@ -13,8 +13,8 @@ from legged.registry import make_task, task_config
 def warmup(args: argparse.Namespace) -> int:
     """Compile and cache the kernels of a task: `legged warmup anymal_c`.
 
-    The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all of its kernels for this
-    machine's GPU, or for its CPU with sim.physics=mujoco_warp, and the next training starts without compiling.
+    The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all kernels of the task for
+    this device, and the next training starts without compiling. C MuJoCo, the usual engine on a CPU, compiles no kernels.
     """
     register_given(args, "task")
     device = pick_device(args.sim_device)

@@ -45,7 +45,7 @@ def watch(args: argparse.Namespace) -> int:
     """Watch a policy in a browser, also while it is trained: `legged watch anymal_c_flat`.
 
     The page shows the newest checkpoint of the run, and the next one as soon as it is written. Without POLICY the newest run
-    of all is shown. The page sets commands, terrain, pushes and the speed of time.
+    of all is shown. Controls on the page set commands, terrain, pushes and playback speed.
     """
     override_is_no_name(args, "policy")
     register_given(args, "policy")
@@ -53,7 +53,7 @@ def watch(args: argparse.Namespace) -> int:
     count = ROBOTS if args.num_envs is None else args.num_envs
     if not 1 <= count <= MOST_ROBOTS:
         raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}")
-    device = pick_device(args.sim_device or "cpu")  # a GPU is left to the training
+    device = pick_device(args.sim_device or "cpu")  # by default a GPU is left to the training
     settle_on(device)
     asked = policy_overrides(args)
     watched = find_watched(args.policy, args.checkpoint)

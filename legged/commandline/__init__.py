@@ -1,1 +1,1 @@
-"""Commands as processes: flags, output, stopping, exit codes."""
+"""Execution of commands as processes: options, output, signals, exit codes."""

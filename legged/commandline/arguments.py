@@ -34,7 +34,7 @@ BUILD = (
     IMPORT,
     argument("--num-envs", type=int, help="number of robots (env.num_envs)"),
     argument("--seed", type=int, help="random seed (env.seed)"),
-    argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; that of the device by default"),
+    argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; by default the device decides"),
     argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default"),
     argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one"),
     argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph"),
@@ -48,15 +48,15 @@ CHECKPOINT = argument("--checkpoint", type=_iteration, help="iteration of the ch
 POLICY = (argument("policy", metavar="POLICY", help=POLICY_HELP), CHECKPOINT, *BUILD)
 """The positional argument POLICY, --checkpoint, and the arguments of `BUILD`."""
 TILES = (
-    argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; the task's own by default"),
-    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; 0.5 and 0.8 by default"),
+    argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; by default the types of the task"),
+    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
 )
 """Options that choose the tiles on which a policy is shown."""
 
 
 def of_legged_gym(name: str) -> tuple[Argument, ...]:
-    """Return the arguments of `train` and `play`: the positional argument `name` or in its place legged_gym's --task, the
-    options that name one of the task's runs, and those of `BUILD`.
+    """Return the arguments that `train` and `play` share: the positional argument `name`, legged_gym's option --task that can
+    replace it, options that choose a run of the task, and the arguments of `BUILD`.
     """
     return (
         argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP),
@@ -73,7 +73,7 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
     positional argument becomes an override.
 
     Raises:
-        ConfigError: both or neither are given.
+        ConfigError: neither is given, or both are given with different values.
     """
     override_is_no_name(args, name)
     given = getattr(args, name)
@@ -86,7 +86,7 @@ def settle_name(args: argparse.Namespace, name: str) -> None:
 
 
 def override_is_no_name(args: argparse.Namespace, name: str) -> None:
-    """Move a `key=value` in the place of the optional positional argument `name` to the overrides."""
+    """If a `key=value` stands in the place of the positional argument `name`, move it to the overrides."""
     given = getattr(args, name)
     if given is not None and OVERRIDE.match(given):
         args.overrides.insert(0, given)
@@ -132,7 +132,7 @@ def velocity_command(text: str) -> tuple[float, float, float]:
     """Return vx, vy [m/s] and yaw rate [rad/s] of --command.
 
     Raises:
-        ConfigError: the text is not three numbers, or one of them is above 100.
+        ConfigError: the text is not three numbers, or one of them is above 100 or below -100.
     """
     try:
         vx, vy, yaw = (float(part) for part in text.split(","))
@@ -144,10 +144,10 @@ def velocity_command(text: str) -> tuple[float, float, float]:
 
 
 def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
-    """Return the requested device, or the GPU if there is one; under torchrun, the GPU with this process's number.
+    """Return the device `name`, by default a GPU if there is one. Under torchrun each process has the GPU of its local rank.
 
     Raises:
-        ConfigError: the device does not exist, or under torchrun it is a GPU that is not this process's.
+        ConfigError: the device does not exist, or under torchrun it is the GPU of another process.
     """
     ranks, gpus = Ranks.now(), torch.cuda.device_count()
     own = f"cuda:{ranks.local_rank}"
@@ -156,7 +156,7 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
     if name is None or (ranks.several and name == "cuda"):
         name = own
     if ranks.several and name not in ("cpu", own):
-        raise ConfigError(f"{flag}: '{name}' is one device for {ranks.count} processes; without the flag each gets its own")
+        raise ConfigError(f"{flag}: all {ranks.count} processes would share '{name}'; without the flag each gets its own GPU")
     if ranks.several and name == own and 0 < gpus <= ranks.local_rank:
         raise ConfigError(
             f"{ranks.local_count} processes need a GPU each, but torch sees {gpus} here; use --nproc-per-node {gpus}"
@@ -182,7 +182,7 @@ def settle_on(device: torch.device) -> None:
         # The C engine uses all cores. If torch's threads compete for them, operations on small tensors become slower.
         torch.set_num_threads(1)
     else:
-        torch.cuda.set_device(device)  # operations without a device must not run on the first GPU
+        torch.cuda.set_device(device)  # operations that name no device must not run on the first GPU
 
 
 def measuring_device(args: argparse.Namespace) -> torch.device:
@@ -205,7 +205,7 @@ def watch_command(args: argparse.Namespace, folder: Path) -> str:
 
 
 def given_import(args: argparse.Namespace) -> list[str]:
-    """Return the --import option by which another command would register the user-defined tasks of this command."""
+    """Return the option --import for another command that is to know the user-defined tasks of this command."""
     files = [file for file in (args.module, args.task_file) if file]
     return ["--import", ",".join(files)] if files else []
 
@@ -217,7 +217,7 @@ def import_given(args: argparse.Namespace) -> None:
 
 
 def register_given(args: argparse.Namespace, name: str) -> None:
-    """Register the user-defined tasks of --import; a YAML file in `args.<name>` becomes a task."""
+    """Register the user-defined tasks of --import. If `args.<name>` is a YAML file, replace it by the name of its task."""
     import_given(args)
     given = getattr(args, name)
     args.task_file = given if given is not None and given.endswith(YAML_ENDINGS) else None

@@ -35,7 +35,7 @@ EXIT_FAILED = 1
 EXIT_WRONG_INPUT = 2
 NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
-"""Pattern in the messages of torch, Warp, NumPy and C++ about too little memory."""
+"""Pattern that matches messages of torch, Warp, NumPy and C++ about a lack of memory."""
 SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
 """Signals from Ctrl-C, from a scheduler, and from a terminal that is closed."""
 
@@ -68,7 +68,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
 
 
 def _engine_warnings() -> AbstractContextManager[None]:
-    """Return a context in which each kind of MuJoCo's warnings is printed once; help and lists do not import it."""
+    """Return a context in which each kind of MuJoCo's warnings is printed once, if MuJoCo is imported."""
     if "mujoco" not in sys.modules:
         return nullcontext()
     from legged.physics.engine_warnings import each_warning_once
@@ -77,11 +77,11 @@ def _engine_warnings() -> AbstractContextManager[None]:
 
 
 class SubCommand:
-    """A command that runs a function of parsed arguments. It is called `legged <module> <function>`, or `legged <module>` if
-    the function has the name of its module in `legged.cli`. A `_` in a name becomes a hyphen; at the end it is left out.
+    """A command that parses its arguments and calls a function with them. It is called `legged <module> <function>`, or
+    `legged <module>` if both have the same name. A `_` in a name becomes a hyphen, and a `_` at the end is left out.
 
     The arguments also have `words`, the list of words of the command line, and `start_s`, the start of the command on the
-    clock of `time.perf_counter` [s]. If the command is the whole process, its start comes before the imports.
+    clock of `time.perf_counter` [s]. If the command is the whole process, `start_s` is before the imports.
     """
 
     def __init__(self, run: Callable[..., int], examples: Sequence[str], arguments: Sequence[Argument]) -> None:
@@ -107,8 +107,8 @@ class SubCommand:
 
 
 def sub_command(*examples: str, arguments: Sequence[Argument] = ()) -> Callable[[Callable[..., int]], SubCommand]:
-    """Make a sub-command of a function that takes parsed arguments and returns an exit code. The function's docstring is the
-    description in the help, which ends with `examples`.
+    """Return a decorator that makes a function a sub-command. The function takes parsed arguments and returns an exit code.
+    Its docstring is the description in the help, and `examples` are at the end of the help.
     """
     return lambda run: SubCommand(run, examples, arguments)
 
@@ -147,7 +147,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
 
 
 def line_of_user(error: BaseException | None) -> str:
-    """Return ' (file, line n)' of the innermost line of user code in the traceback of `error`."""
+    """Return ' (file, line n)' of the innermost line of user code in the tracebacks of `error` and its causes, or ''."""
     frames: list[traceback.FrameSummary] = []
     while error is not None:
         frames += traceback.extract_tb(error.__traceback__)
@@ -157,7 +157,7 @@ def line_of_user(error: BaseException | None) -> str:
 
 
 def _file_of(error: BaseException) -> str:
-    """Return the file in which an error was raised; for a missing attribute, the file that uses it."""
+    """Return the file in which an error was raised, or the file that reads an attribute if a `__getattr__` raised it."""
     frames = traceback.extract_tb(error.__traceback__)
     while len(frames) > 1 and frames[-1].name == "__getattr__":
         frames.pop()
@@ -197,7 +197,7 @@ def _say(text: str) -> None:
 
 
 class Output:
-    """A text stream that discards text once it can't be written any more."""
+    """A text stream that discards text once writing has failed."""
 
     def __init__(self, stream: TextIO | None) -> None:
         """Wrap `stream`, which is None in a process that was started without one."""
@@ -233,7 +233,7 @@ class Output:
             raise
         except (OSError, ValueError) as error:  # ValueError: the stream was closed
             self.lost = _why(error)
-            if self._stream in (sys.__stdout__, sys.__stderr__):  # text in Python's buffer must not fail at exit
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # at exit Python writes its buffer, which must not fail
                 with suppress(OSError, ValueError):
                     nowhere = os.open(os.devnull, os.O_WRONLY)
                     os.dup2(nowhere, self._stream.fileno())
@@ -277,12 +277,12 @@ def forgiving_output() -> Iterator[Output]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Call `stop` at the first signal, which ends a training after its iteration; raise KeyboardInterrupt at the second.
-    Yield a list that collects the signals. The earlier handlers are restored afterwards.
+    """Call `stop` at the first signal, so that a training ends after its iteration. Raise KeyboardInterrupt at the second.
+    Yield a list to which received signals are appended. The earlier handlers are restored afterwards.
 
-    With several processes, all stop as soon as one receives a signal. There a second signal has no effect, because torchrun
-    passes on the signal that the terminal has already sent to each process. torchrun kills processes that take more than half
-    a minute to end. Outside the main thread signals keep their handlers, because Python can't set others there.
+    With several processes, all stop as soon as one receives a signal, and a second signal has no effect: it may be the same
+    Ctrl-C, which the terminal sends to each process and torchrun sends again. torchrun kills processes that take more than
+    half a minute to end. Outside the main thread signals keep their handlers, because Python can't set others there.
     """
     received: list[int] = []
     ranks = Ranks.now()
@@ -297,7 +297,7 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
                 print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
         stop()
 
-    # A signal that nohup ignores stays ignored: the training is to outlive its terminal.
+    # A signal that nohup has set to be ignored stays ignored, so that a training can outlive its terminal.
     numbers = [n for n in SIGNALS if n == signal.SIGINT or signal.getsignal(n) != signal.SIG_IGN] if in_main_thread() else []
     before = {number: signal.signal(number, handler) for number in numbers}
     try:

@@ -63,7 +63,7 @@ def _robot(task: BaseTask) -> Iterator[str]:
     for name in task.cfg.origins.reference_robots:
         by = growth(size_of(name), size)
         if set(by.values()) == {1.0}:
-            line += "; numbers are written for it"
+            line += "; its settings are written for this robot"
         else:
             factors = f"masses x {by['kg']:.3g}, lengths x {by['m']:.3g}, times x {by['s']:.3g}"
             line += f"; numbers written for {Path(name).name} are rescaled: {factors}"
@@ -84,7 +84,7 @@ def _observations(task: BaseTask) -> Iterator[str]:
             columns = f"{term.columns.start}:{term.columns.stop}"
             rows.append((columns, term.name, ", ".join(map(_number, scales)), noise, _says(task, f"_obs_{term.name}")))
         steps = f" x {group.history} steps, oldest first" if group.history > 1 else ""
-        yield from _table(f"observations '{name}': {width} numbers{steps}; noise before scaling", *rows)
+        yield from _table(f"observations '{name}': {width} numbers{steps}; noise is added before scaling", *rows)
 
 
 def _rewards(task: BaseTask) -> Iterator[str]:
@@ -108,7 +108,7 @@ def _terminations(task: BaseTask) -> Iterator[str]:
 
 
 def _randomisation(task: BaseTask) -> Iterator[str]:
-    """Yield the properties that differ from robot to robot, including those with legged_gym's names, and the disturbances."""
+    """Yield two tables: randomised properties, also by settings with legged_gym's names, and disturbances."""
     rand, draws = task.cfg.domain_rand, task.randomization.draws
     drawn = {name: (draw, task.randomization.is_each(name)) for name, draw in draws.items()}
     pushes: list[tuple[str, str, str]] = []
@@ -127,7 +127,7 @@ def _randomisation(task: BaseTask) -> Iterator[str]:
         rows.append((name, _span(draw.range, field.unit), draw.distribution + sigma, moment, field.meaning))
     if rows:
         header = ("property", "range", "distribution", "drawn", "what it is")
-        yield from _table("randomised; play and evaluation switch it off unless told otherwise", header, *rows)
+        yield from _table("randomised properties; by default play and evaluation do not randomise", header, *rows)
     if pushes:
         yield from _table("disturbances", ("name", "how much", "when"), *pushes)
 
@@ -171,7 +171,7 @@ def _effect(task: BaseTask, i: int) -> str:
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
     bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
-    # The force of a servo, a muscle or a tendon's motor is not a fixed multiple of the control.
+    # Only the force of a motor on a joint is a fixed multiple of the control.
     if not on_joint or not gains or bias:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])

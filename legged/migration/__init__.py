@@ -1,1 +1,1 @@
-"""Migration of configuration classes of legged_gym and its forks to tasks. Their files are parsed, never run."""
+"""Migration of configurations of legged_gym and its forks to tasks. A child process runs the configurations' files."""

@@ -1,7 +1,7 @@
-"""Program that runs a fork's configuration and prints its live values, methods and terrain types as JSON.
+"""Program that runs a fork's configuration and prints its values, methods and terrain types as JSON.
 
 `reading.py` starts it as a child process. It imports nothing of this package. Stand-ins replace modules that are not
-installed, and always Isaac Gym. Any use of a stand-in gives another stand-in.
+installed, and always those in `REPLACED`. Any use of a stand-in gives another stand-in.
 """
 
 import abc
@@ -30,11 +30,11 @@ SECTIONS = (
 )
 LEARNER_SECTIONS = ("policy", "algorithm", "runner")
 REPLACED = ("isaacgym", "rsl_rl")
-"""Modules with a stand-in even if they are installed."""
+"""Modules that stand-ins replace even if they are installed."""
 ALONE = "file_of_the_user"
 """Name of the package that is made for a file outside any package."""
 BUILT_IN = "legged_gym's"
-"""Name of the module of the classes in `KNOWN`."""
+"""Module name of the classes in `KNOWN`."""
 GAP = 2
 """Largest number of folders without __init__.py between a file and its package."""
 LONGEST = 100_000
@@ -44,11 +44,11 @@ INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<f
 READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
 """Name -> pattern that is searched for in the text of a method."""
 CUT = "(cut)"
-"""Name for a selection of columns of joined parts."""
+"""Name of a stand-in for some columns of joined parts."""
 CALLS: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 """Calls of stand-ins: name, and arguments."""
 KNOWN: dict[str, Any] = {}
-"""Objects of legged_gym that its stand-in has, by name."""
+"""Name -> object of legged_gym, which the stand-in of legged_gym provides."""
 USED: dict[str, None] = {}
 """Names of the classes in `KNOWN` that the user's files import."""
 
@@ -69,7 +69,7 @@ class StandIn:
         name = self.names[0].rpartition(".")[2]
         CALLS.append((name, args, options))
         if len(args) == 1 and not options and (isinstance(args[0], type) or inspect.isfunction(args[0])):
-            return args[0]  # a decorator
+            return args[0]  # used as a decorator
         if name == "cat" and args and isinstance(args[0], list | tuple):
             return StandIn(*self.names, parts=[part for item in args[0] for part in item.parts or [item]])
         return _computed(self, *args)
@@ -132,8 +132,8 @@ class StandInModule(types.ModuleType):
 
 
 class Finder:
-    """Finder of stand-ins for modules that the user's files import. If an installed package imports an optional module, it
-    gets no stand-in.
+    """Finder of stand-ins for modules that the user's files import. Modules that an installed package imports get no
+    stand-in, because they may be optional.
     """
 
     def __init__(self, only: tuple[str, ...] = (), own: str = "") -> None:
@@ -154,7 +154,7 @@ class Finder:
         return StandInModule(spec.name)
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Give the stand-in the names that Isaac Gym's star import has."""
+        """Give the stand-in of isaacgym.torch_utils the modules that a star import of the original provides."""
         if module.__name__ == "isaacgym.torch_utils":
             exec("import os, torch, numpy as np", vars(module))
 
@@ -170,7 +170,7 @@ def _is_of_fork(module: str) -> bool:
 
 
 def define(name: str, data: dict[str, Any], parent: Any) -> type:
-    """Return a class with the values of a table; nested tables are nested classes, except tables by joint."""
+    """Return a class with the values of a table. Nested tables become nested classes, except tables of joints."""
     own: dict[str, Any] = {"__module__": BUILT_IN, "__qualname__": name}
     for key, value in data.items():
         nested = isinstance(value, dict) and key not in ("default_joint_angles", "stiffness", "damping")
@@ -179,7 +179,7 @@ def define(name: str, data: dict[str, Any], parent: Any) -> type:
 
 
 def load(file: Path) -> tuple[types.ModuleType, Path]:
-    """Import the file as a module of its package. Return the module, and the folder of the package or else of the file."""
+    """Import the file as a module of its package. Return the module, and the folder of its package or else of the file."""
     gap, root, own = 0, file.parent, ALONE
     for folder in file.parents:
         gap += 1
@@ -209,8 +209,8 @@ def objects() -> list[Any]:
 
 
 def fork_classes(attribute: str) -> list[type]:
-    """Return the user's classes that have an attribute whose name begins with `attribute`. Base classes of others are left
-    out.
+    """Return the user's classes that have an attribute whose name begins with `attribute`. A class from which another one
+    of them is derived is left out.
     """
     classes = dict.fromkeys(value for value in objects() if isinstance(value, type) and _is_of_fork(value.__module__))
     having = [cls for cls in classes if any(name.startswith(attribute) for name in dir(cls))]
@@ -237,8 +237,8 @@ def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str,
 
 
 def configurations(module: types.ModuleType) -> dict[str, type]:
-    """Return the environment configurations that a module defines. A function `config_*` makes a configuration of a class
-    that its module imports.
+    """Return the environment configurations that a module defines. If it only imports a class, each
+    function `config_*` of the module turns this class into a configuration.
     """
     learners = with_sections(module, LEARNER_SECTIONS)
     classes = {name: value for name, value in with_sections(module, SECTIONS).items() if name not in learners}
@@ -263,7 +263,7 @@ def learner_of(module: types.ModuleType, name: str) -> Any:
 
 @functools.cache
 def nodes_of(file: str) -> dict[str, Any]:
-    """Return dotted name of a class, of its method or of its attribute -> node of a file's syntax tree."""
+    """Return dotted name -> node of a file's syntax tree, for classes, methods and attributes of classes."""
     found: dict[str, Any] = {}
 
     def visit(node: ast.AST, prefix: str) -> None:
@@ -290,14 +290,14 @@ def place_of(owner: type, name: str) -> tuple[str, int]:
 
 
 class NotPlain(Exception):
-    """A value that is not made of numbers, texts, lists and tables."""
+    """Exception for a value that is not made of numbers, texts, lists and tables."""
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it.
+    """Return a value as JSON represents it: numbers, texts, lists and tables.
 
     Raises:
-        NotPlain: the value has no such form; the text says why.
+        NotPlain: JSON cannot represent the value; the text gives the reason.
     """
 
     def other(item: Any) -> Any:
@@ -315,7 +315,7 @@ def plain(value: Any) -> Any:
         raise NotPlain("is too large") from None
     if len(text) > LONGEST:
         raise NotPlain("is too large")
-    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # no negative zeros
+    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # turns -0.0 into 0.0
 
 
 def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:
@@ -343,7 +343,7 @@ def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict
 
 def method(function: Any) -> dict[str, Any]:
     """Return place and digest of a method, and the names of `READS` that it reads. The digest does not depend on layout and
-    docstring. Rewards in a container class read `self.env` in place of `self`.
+    docstring, or on whether attributes are read from `self` or, as in a container of rewards, from `self.env`.
     """
     code = inspect.unwrap(function).__code__
     node = nodes_of(code.co_filename).get(code.co_qualname, ast.parse(""))
@@ -382,8 +382,8 @@ def environment_classes(task_class: Any, root: Path) -> list[type]:
 
 
 def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> None:
-    """Run a function with `values` for the arguments of those names, stand-ins for all other arguments, and `others` in place
-    of its globals.
+    """Run a function. Its arguments are the `values` of the same names; stand-ins replace missing ones. `others` replace its
+    globals of the same names.
     """
     run = types.FunctionType(function.__code__, function.__globals__ | others, None, None, function.__closure__)
     CALLS.clear()
@@ -391,9 +391,9 @@ def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> Non
 
 
 def terrains(config: Any) -> list[Any] | None:
-    """Return, for each entry of terrain_proportions and for each half of its columns, the terrain functions that the fork's
-    make_terrain calls, joined by " + ", and the sign of the first one's slope or height of steps; None for a half that fails,
-    and without such a method.
+    """Return an item for each entry of terrain_proportions; None if the fork has no make_terrain. An item has a pair for each
+    half of the entry's columns: the names of the terrain functions that make_terrain calls, joined by " + ", and the sign of
+    the first one's slope or step height. If make_terrain fails, None takes the place of the pair.
     """
     shares, makers = getattr(config, "terrain_proportions", None), fork_classes("make_terrain")
     if not makers or not isinstance(shares, list | tuple):
@@ -424,8 +424,8 @@ def sign(args: tuple[Any, ...], options: dict[str, Any]) -> int:
 
 
 def observations(cls: type, config: Any) -> list[Any]:
-    """Return the parts that compute_observations joins for the policy and for the value function, each as the names and
-    numbers that it is computed from. A list is None if its parts can't be determined.
+    """Return two lists of the parts that compute_observations joins: for the policy and for the value function. A part is the
+    list of names and numbers from which it is computed. A list of parts is None if they can't be determined.
     """
     self = StandIn("self")
     vars(self).update(cfg=config)
@@ -438,7 +438,7 @@ def observations(cls: type, config: Any) -> list[Any]:
 
 
 def answer(request: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer to a request: file, task, and legged_gym's defaults."""
+    """Return the answer to a request that has a file, a task, and legged_gym's classes and names of methods."""
     registry = types.SimpleNamespace(task_classes={}, env_cfgs={}, train_cfgs={})
     tables = list(vars(registry).values())
     registry.register = lambda name, *entries: [t.update({name: entry}) for t, entry in zip(tables, entries, strict=False)]

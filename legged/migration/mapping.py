@@ -1,4 +1,4 @@
-"""Mapping of a fork's live configuration and methods to a task."""
+"""Mapping of a fork's settings and methods to a task."""
 
 import re
 from typing import Any
@@ -24,11 +24,11 @@ OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 
 
 def map_settings(fork: Fork) -> Translation:
-    """Map the settings and the methods of a fork."""
+    """Return the task that the settings and the methods of a fork become."""
     result = Translation(_moved(fork.settings))
     for theirs, ours in tables.SAME.items():
         if theirs in tables.ABSENT and theirs not in result.theirs:
-            result.put(ours, tables.ABSENT[theirs], "", "theirs has no such setting")
+            result.put(ours, tables.ABSENT[theirs], "", "the fork has no such setting")
     result.take(tables.SAME)
     if not result.settings.get("domain_rand.randomize_base_mass", False):
         result.settings.pop("domain_rand.added_mass_range", None)
@@ -46,7 +46,7 @@ def map_settings(fork: Fork) -> Translation:
 
 
 def _moved(settings: dict[str, Found]) -> dict[str, Found]:
-    """Return the settings with their paths changed to legged_gym's."""
+    """Return the settings with legged_gym's paths in place of the fork's."""
     paths = {}
     for path in settings:
         start = next((old for old in tables.MOVED if path == old or (old.endswith(".") and path.startswith(old))), "")
@@ -68,7 +68,7 @@ def _terrain(result: Translation, fork: Fork) -> None:
     result.take(tables.OF_TERRAIN)
     rows = int(result.get("terrain.num_rows", 10.0))
     if result.get("terrain.max_init_terrain_level", 5.0) >= rows > 0:
-        result.put("terrain.max_init_terrain_level", rows - 1, "terrain.max_init_terrain_level", "of the rows there are")
+        result.put("terrain.max_init_terrain_level", rows - 1, "terrain.max_init_terrain_level", "limited to the last row")
     named = path in result.theirs and isinstance(result.theirs[path].value, dict)
     _fits(result, "flat")
     shares = result.get(path, {}) if named else _shares(result.get(path, []), fork.terrains)
@@ -76,8 +76,8 @@ def _terrain(result: Translation, fork: Fork) -> None:
     kept = {name: share for name, share in shares.items() if name in TERRAIN_TYPES and _fits(result, name)}
     unknown = [name for name in shares if name not in kept]
     if unknown:
-        result.lose(path, f"not here or too large: {', '.join(unknown)}; types here are in terrain.md")
-    comment = "none of the file's types is here" if not kept else f"theirs has {', '.join(unknown)} too" if unknown else ""
+        result.lose(path, f"unknown here, or too large for the tiles: {', '.join(unknown)}; docs/terrain.md lists the types")
+    comment = "the fork's types do not exist here" if not kept else f"without {', '.join(unknown)}" if unknown else ""
     kept = kept or {"flat": 1.0}
     total = sum(kept.values())
     kept, joined = _of_whole_columns({name: share / total for name, share in kept.items()}, result)
@@ -86,7 +86,7 @@ def _terrain(result: Translation, fork: Fork) -> None:
 
 
 def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, float]:
-    """Return terrain type -> share of a list, by the functions that the fork calls, or by legged_gym's order."""
+    """Return terrain type -> share. `functions`, or else legged_gym's order, give the types for each of `proportions`."""
     shares: dict[str, float] = {}
     kinds = tables.TERRAINS if functions is None else functions
     for i, share in enumerate(proportions):
@@ -101,7 +101,7 @@ def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, 
 
 
 def _fits(result: Translation, name: str) -> bool:
-    """Return True if a terrain type fits on the file's tiles. If no type could fit, take the default tile sizes."""
+    """Return True if a terrain type fits on the fork's tiles. If not even `flat` fits, take the default tiles."""
     sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
     try:
         check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
@@ -115,7 +115,7 @@ def _fits(result: Translation, name: str) -> bool:
 
 
 def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[dict[str, float], list[str]]:
-    """Return shares rounded to whole columns, and the types that are left out because their share is less than a column."""
+    """Return the shares without types that would get less than one column, and these types. Other types get their shares."""
     columns, out = int(result.settings.get("terrain.num_cols", DEFAULTS["terrain"]["num_cols"])), []
     while len(shares) > 1 and min(shares.values()) * columns < 1.0 - 1e-9:
         name = min(shares, key=lambda key: shares[key])
@@ -138,16 +138,16 @@ def _commands(result: Translation) -> None:
     low, high = speeds
     if limit <= max(-low, high):
         return
-    comment = f"theirs grows from {low:g} to {high:g} up to max_curriculum"
+    comment = f"the fork widens {low:g} to {high:g} up to max_curriculum"
     result.put("commands.ranges.lin_vel_x", [-limit if low < 0 else low, limit], "commands.max_curriculum", comment)
     result.put("commands.curriculum.enabled", True, "commands.curriculum")
     start = round(max(-low, high) / limit, 4)
-    comment = "of the full range, on every axis; legged_gym widens vx alone"
+    comment = "share of the full range, on every axis; legged_gym widens only vx"
     result.put("commands.curriculum.start", start, "commands.max_curriculum", comment)
 
 
 def _contacts(result: Translation) -> None:
-    """Average the robot's friction with the ground's, as PhysX does; MuJoCo takes the robot's. Map the filter of contacts."""
+    """Map self-collisions, and the friction range to its mean with the ground's friction, because PhysX averages both."""
     own = result.get("domain_rand.friction_range", [])
     ground = result.get("terrain.static_friction", 1.0)
     if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
@@ -157,14 +157,14 @@ def _contacts(result: Translation) -> None:
     path = "asset.self_collisions"
     if path in result.theirs and result.get(path, 1.0) == 0:
         if result.theirs[path].place.startswith("legged_gym's"):
-            result.lose(path, "legged_gym lets a robot touch itself unless told otherwise; sim.self_collisions=true does")
+            result.lose(path, "legged_gym simulates self-collisions by default; here sim.self_collisions=true does")
         else:
-            result.put("sim.self_collisions", True, path, "theirs is a filter, 0 lets through")
+            result.put("sim.self_collisions", True, path, "in the fork this is a filter, and 0 allows self-collisions")
 
 
 def _rewards(result: Translation, fork: Fork) -> None:
-    """Map the scales of rewards that have legged_gym's formula. For all other rewards, name the methods to paste; they get no
-    scale.
+    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale; note which methods the user
+    has to paste for them.
     """
     known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
     sigma, mapped, paste = "", set(), []
@@ -175,7 +175,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
             continue
         methods = fork.methods.get(f"_reward_{name}", [])
         own = next((method for method in methods if not method.original), None)
-        # In legged_gym the scale feet_stumble has no method, so it has no effect.
+        # legged_gym has a scale feet_stumble for the method _reward_stumble; since the names differ, it has no effect there.
         ours = "stumble" if name == "feet_stumble" and not fork.methods else name
         then = f"rewards.scales.{name}: {scale:g}"
         if fork.methods and not methods:
@@ -190,7 +190,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
         result.put(f"{prefix}{name}", 0.0, "")
     path = f"rewards.{SIGMA}"
     if sigma and path in result.theirs:
-        result.lose(path, f"divides the squared error here; {sigma} has another formula: set it with that method")
+        result.lose(path, f"divides the squared error here, but the formula at {sigma} differs: set it with that method")
     else:
         result.take({path: path})
     counted = f"{len(mapped)} of {len(mapped) + len(paste)} scales are mapped, with legged_gym's formulas"
@@ -201,7 +201,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
 
 
 def _observations(result: Translation, fork: Fork) -> None:
-    """Map the observations by the parts that compute_observations joins or, without a class, by their number."""
+    """Map the observations: from the parts that compute_observations joins or, without a class, from their number."""
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
     history, one = (result.get(result.has(*names) or names[0]) for names in (tables.HISTORY, tables.ONE_STEP))
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
@@ -210,15 +210,15 @@ def _observations(result: Translation, fork: Fork) -> None:
     if "compute_observations" not in fork.methods:
         (groups[0], steps), (groups[1], _) = (_by_number(result, number) for number in numbers)
         history = history or steps
-        text = "guessed from the number alone, since there is no class near the file"
+        text = "guessed from their number, because no class was found near the file"
         if groups[0] is None:
-            text = f"{numbers[0]} numbers are not those of legged_gym: the groups here are the defaults"
+            text = f"{numbers[0]} numbers are not legged_gym's observations: the default groups remain"
     elif fork.observations[0] is None:
-        text = f"{fork.methods['compute_observations'][0].place} joins them in its own way: the groups here are the defaults"
+        text = f"{fork.methods['compute_observations'][0].place} joins them in an unknown way: the default groups remain"
     else:
         own: list[str] = []
         groups = [part and _terms(part, own) for part in fork.observations]
-        text = ", ".join(groups[0] or []) or "none of the terms here"
+        text = ", ".join(groups[0] or []) or "no terms of this package"
         if own:
             where = fork.methods["compute_observations"][0].place
             text += f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where})"
@@ -246,7 +246,7 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
 
 
 def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
-    """Return the usual terms with exactly this many numbers, and their number of steps."""
+    """Return those of legged_gym's lists of terms, and the number of steps, that give `number` numbers; else None and 1."""
     joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if result.get("terrain.measure_heights", False):
@@ -283,7 +283,7 @@ def _random_model(result: Translation) -> None:
                 result.done -= {path} - {entry.setting for entry in result.lost}
                 continue
             result.done.add(switch)
-            # An offset is added to the measured angle here, and to the target in forks.
+            # Here an offset is added to the measured angle. Forks add it to the target, so the sign changes.
             pair = [0 - pair[1], 0 - pair[0]] if ours == "joint_offset" else pair
             for field in ours.split():
                 result.put(field if "." in field else f"domain_rand.ranges.{field}", pair, path)
@@ -315,15 +315,15 @@ def _delay(result: Translation) -> None:
 
 
 def _hooks(result: Translation, fork: Fork) -> None:
-    """Name the fork's methods that no setting replaces, and the commands that have another meaning."""
+    """Note the fork's own methods that no setting replaces, and methods that read commands with another meaning here."""
     own = {name: method for name, methods in fork.methods.items() for method in methods if not method.original}
     hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:
-        result.note("methods", f"the fork's own, to be moved by hand (docs/migrating.md): {', '.join(hooks)}")
+        result.note("methods", f"move the fork's own methods by hand (docs/migrating.md): {', '.join(hooks)}")
     fourth = [name for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING]
     readers = [f"{name} ({own[name].place})" for name in fourth]
     if readers:
-        result.note("commands", f"commands[:, 3] is the heading here, and there are no others; compare {', '.join(readers)}")
+        result.note("commands", f"commands[:, 3] is the heading here, and the last command; check {', '.join(readers)}")
 
 
 def _rest(result: Translation) -> None:
@@ -337,7 +337,7 @@ def _rest(result: Translation) -> None:
         plain = not found.why_unknown and all(isinstance(item, bool | int | float | str) for item in items)
         if path.startswith("rewards.") and plain and not reason:
             name = path.removeprefix("rewards.").replace(".", "_")
-            result.put(f"custom.{name}", found.value, path, f"self.cfg.custom['{name}']; theirs is self.cfg.{path}")
+            result.put(f"custom.{name}", found.value, path, f"read it as self.cfg.custom['{name}'], not as self.cfg.{path}")
         elif re.match(tables.MINOR, path):
             result.minor.append(path)
         else:

@@ -1,7 +1,7 @@
-"""Reading of a fork's configuration: `child.py` runs it in another process, and this module takes what it prints.
+"""Reading of a fork's configuration. `child.py` runs the fork's files in another process; this module reads its output.
 
-`legged_gym.yaml` has legged_gym's classes (`known`: name, base class, values), so that files that extend them run without it;
-rsl_rl's defaults; and digests of legged_gym's methods, because a fork may change a formula but keep its name.
+`legged_gym.yaml` has legged_gym's configuration classes (`known`), so that files that extend them run without legged_gym. It
+also has rsl_rl's defaults, and digests of legged_gym's methods, by which changed formulas are recognised.
 """
 
 import json
@@ -48,12 +48,12 @@ class Method:
     original: bool
     """True if it is legged_gym's method of that name."""
     reads: tuple[str, ...]
-    """Names of `child.READS` that it reads."""
+    """Names of `child.READS` that the method reads."""
 
 
 @dataclass(frozen=True)
 class Fork:
-    """The live objects of a fork."""
+    """Values and methods of a fork."""
 
     task: str
     """Name of the task."""
@@ -71,11 +71,11 @@ class Fork:
 
 
 def read_fork(path: Path, asked: str | None) -> Fork:
-    """Run the file at `path` and return its live objects. `asked` is a class of the file, a registered task, or the name of
-    the new task.
+    """Run the file at `path` and return its values and methods. `asked` is a class of the file, a registered task, or the
+    name of the new task.
 
     Raises:
-        ConfigError: the file fails, has no configuration, or has several of which `asked` chooses none.
+        ConfigError: the file fails, has no configuration, or has several and `asked` is not one of them.
     """
     data = run_child(path, asked)
     if "error" in data:
@@ -84,17 +84,17 @@ def read_fork(path: Path, asked: str | None) -> Fork:
     if "settings" not in data:
         which = suggest(asked or "", [*data["classes"], *data["tasks"]], "--task")
         if data["classes"]:
-            given = "" if asked is None else f"{shown(asked)} names none of the classes: "
-            raise ConfigError(f"--task: {relative(path)} has several configurations, {given}say which{which}")
-        tasks = f"; it registers tasks: --task{suggest(asked or '', data['tasks'], 'tasks')}" if data["tasks"] else ""
+            given = "" if asked is None else f", but none is called {shown(asked)}"
+            raise ConfigError(f"--task: {relative(path)} has several configurations{given}; name one{which}")
+        tasks = f"; choose a registered task: --task{suggest(asked or '', data['tasks'], 'tasks')}" if data["tasks"] else ""
         raise ConfigError(f"{relative(path)}: has no configuration of an environment (class XCfg(LeggedRobotCfg)){tasks}")
     settings = {path: Found(value, _place(*where), why) for path, (value, *where, why) in data["settings"].items()}
     for section, values in ORIGINAL["rsl_rl"].items():
         named = [found.place for name, found in settings.items() if name.startswith(f"{section}.")]
-        if named:  # without a base class, rsl_rl's defaults apply
+        if named:  # for values that the fork does not set, rsl_rl's defaults apply
             missing = {f"{section}.{name}": Found(value, f"rsl_rl's default; {named[0]}") for name, value in values.items()}
             settings = missing | settings
-    built_in = f"; {', '.join(sorted(data['built_in']))} as legged_gym v1.0.2 has them" if data["built_in"] else ""
+    built_in = f"; {', '.join(sorted(data['built_in']))} from legged_gym v1.0.2" if data["built_in"] else ""
     methods = {
         name: [Method(_place(*m["place"]), m["digest"] == DIGESTS.get(name), tuple(m["reads"])) for m in entries]
         for name, entries in data["methods"].items()
@@ -109,12 +109,12 @@ def _place(file: str, line: int) -> str:
 
 
 def run_child(path: Path, asked: str | None) -> dict[str, Any]:
-    """Return the child's answer, with the last line of the output of the user's files as `said`."""
+    """Run `child.py` and return its answer. `said` is the last line that the user's files printed."""
     request = {"file": str(path.resolve()), "task": asked, "known": ORIGINAL["known"], "methods": list(DIGESTS)}
     with tempfile.TemporaryFile() as output:
         try:
             done = subprocess.run(
-                [sys.executable, "-P", str(CHILD)],  # -P keeps the child's folder off the search path
+                [sys.executable, "-P", str(CHILD)],  # -P keeps the child's folder off the import path
                 input=json.dumps(request).encode(),
                 stdout=subprocess.PIPE,
                 stderr=output,

@@ -1,4 +1,4 @@
-"""Robot settings of a fork's configuration -> control tables of a task, and entries of robot.yaml."""
+"""Mapping of a fork's robot settings to control tables of a task and to entries of robot.yaml."""
 
 import re
 from pathlib import Path
@@ -23,13 +23,13 @@ LISTS = (
 
 
 def asset_of(result: Translation) -> str:
-    """Return the path of the robot's file in a configuration, without the name of the fork's folder, which is in braces."""
+    """Return the path of the robot's file in a configuration, without {LEGGED_GYM_ROOT_DIR} or the like at its beginning."""
     return re.sub(r"^\{\w+\}/*", "", str(result.get("asset.file", "") or ""))
 
 
 def names_of(result: Translation) -> list[str]:
-    """Return possible names of the robot in this package: the actor's name, the file's name, and the name of the file's
-    parent folder.
+    """Return possible names of the robot in this package: the asset's name, and the names of its file and of the folders
+    above the file.
     """
     path = Path(asset_of(result))
     folders = [part for part in path.parts[:-1] if part not in ("resources", "robots", "urdf", "xml", "mjcf", "..", ".", "/")]
@@ -42,7 +42,7 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
     """
     gains = {name: result.get(f"control.{name}", {}) for name in ("stiffness", "damping")}
     if result.get("control.use_actuator_network", False) or result.get("control.control_type") == "actuator_net":
-        gains = {}  # torques come from a network
+        gains = {}  # a network computes the torques
     entries: dict[str, Any] = {}
     patterns = {ours: _patterns(result, theirs) for theirs, ours in LISTS}
     position, pose = result.get(POSITION, []), result.get(POSE, {})
@@ -52,7 +52,7 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
         if robot is None or abs(position[2] - robot.file.spawn_height) >= 1e-6:
             entries["spawn_height"] = float(position[2])
         if any(position[:2]):
-            result.lose(POSITION, "robots start on their tiles' middles here; the height alone is taken")
+            result.lose(POSITION, "robots start in the middle of their tiles here, so only the height is taken")
     for name, table in gains.items():
         if robot is not None:
             _gains(result, robot, name, table)
@@ -74,7 +74,7 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
             if tuple(sorted(found)) != tuple(own) and (found or not patterns[ours]):
                 entries[ours] = list(dict.fromkeys(kept))
     count, few = result.get("env.num_actions"), ", ".join(robot.joint_names[:MOST_NAMES])
-    other = f"; theirs has {count} actions" if count not in (None, robot.num_dof) else ""
+    other = f"; the fork has {count} actions" if count not in (None, robot.num_dof) else ""
     order = f"in the order {few}{', ...' if robot.num_dof > MOST_NAMES else ''}"
     text = f"{robot.name} has {robot.num_dof} joints {order}{other}; Isaac Gym's order may differ: index them by name"
     result.note("robot", text)
@@ -101,7 +101,7 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
     wanted = {joint: [v for pattern, v in table.items() if pattern in joint] for joint in robot.joint_names}
     bare = [joint for joint, values in wanted.items() if not values]
     if bare:
-        result.lose(path, f"says nothing of {', '.join(bare)}; legged_gym gives such joints none")
+        result.lose(path, f"has no value for {', '.join(bare)}; legged_gym then uses 0")
     numbers = [values[-1] if values else 0.0 for values in wanted.values()]
     if not np.allclose(numbers, own):
         exact = not bare and np.allclose(numbers, robot.each(table, name))
@@ -113,7 +113,7 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
 def _contacts(
     result: Translation, theirs: str, patterns: list[str], shapes: Shapes, robot: str
 ) -> tuple[list[str], set[int]]:
-    """Return those patterns of a list that match shapes or bodies of the robot, and the indices of the matched shapes."""
+    """Return the patterns that match, some replaced by names of shapes, and the indices of the matched shapes."""
     found: set[int] = set()
     kept: list[str] = []
     for pattern in patterns:
@@ -122,7 +122,7 @@ def _contacts(
         except ConfigError:
             result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot} that collides")
             continue
-        # The shape of a foot on a shank does not belong to the shank.
+        # A pattern for a body does not mean feet: the shape of a foot may be on the body of the shank.
         named = theirs == LISTS[0][0] or any(pattern in name for name in shapes.names)
         chosen = [i for i in indices if named or shapes.contact[i] not in shapes.feet]
         kept += [pattern] if len(chosen) == len(indices) else [shapes.names[i] for i in chosen]

@@ -2,8 +2,8 @@
 
 
 def _pairs(text: str) -> dict[str, str]:
-    """Return setting -> setting here. A line has a fork's section, the section of this package, and names, as theirs=ours
-    where they differ.
+    """Return setting of a fork -> setting of this package. A line of `text` has the fork's section, this package's section,
+    and names; a name that differs is written as theirs=ours.
     """
     pairs: dict[str, str] = {}
     for line in text.strip().splitlines():
@@ -19,7 +19,7 @@ MOVED = {
     "reward_scales.": "rewards.scales.",
     **_pairs("commands -> commands.ranges: lin_vel_x lin_vel_y ang_vel_yaw heading"),
 }
-"""Beginning of a setting's path in a fork, or a whole path without a dot at its end -> legged_gym's path."""
+"""Path in a fork -> path in legged_gym. A path with a dot at its end stands for all paths that begin with it."""
 
 SAME = {"seed": "env.seed"} | _pairs("""
 env -> env: num_envs episode_length_s
@@ -50,8 +50,8 @@ OF_TERRAIN = _pairs("""
 terrain -> terrain: horizontal_scale border_size curriculum max_init_terrain_level
 terrain -> terrain: terrain_length terrain_width num_rows num_cols
 """)
-"""More settings with the same meaning, for ground that is not a plane. `OF_HEIGHTS` is for measured heights, `OF_RECURRENT`
-for recurrent policies."""
+"""More settings with the same meaning, which are mapped only if the ground is not a plane. Those of `OF_HEIGHTS` are mapped
+only if heights are measured, and those of `OF_RECURRENT` only for recurrent policies."""
 OF_HEIGHTS = _pairs("terrain -> terrain: measured_points_x measured_points_y")
 OF_RECURRENT = _pairs("policy -> train.policy: rnn_type rnn_hidden_size=rnn_hidden_dim rnn_num_layers")
 ABSENT = {
@@ -60,8 +60,8 @@ ABSENT = {
     **{f"commands.ranges.{name}": [0.0, 0.0] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")},
     **{f"noise.noise_scales.{name}": 0.0 for name in ("gravity", "lin_vel", "ang_vel", "dof_pos", "dof_vel")},
 }
-"""Setting of this package -> value if a fork lacks such a setting. The default would add something that the fork does not
-do."""
+"""Setting of a fork -> value of its counterpart if the fork lacks the setting. This package's default would add something
+that the fork does not do."""
 RANDOM_MODEL = {
     "link_mass": "link_mass",
     "restitution": "restitution",
@@ -73,18 +73,18 @@ RANDOM_MODEL = {
     "joint_friction": "joint_friction",
     "init_state.dof_pos_factor": "initial_joint_pos",
 }
-"""Property or setting of this package -> names in forks. There randomize_<name> switches on <name>_range or
-randomize_<name>_range. If the range has another name, it follows after a colon."""
+"""Property or setting of this package -> names in forks. In a fork randomize_<name> is the switch, and <name>_range or
+randomize_<name>_range is the range. If the range has another name, that name follows after a colon."""
 HISTORY = (
     *("env.frame_stack", "env.obs_history_length", "env.num_observation_history"),
     *("env.history_len", "env.include_history_steps"),
 )
-"""Settings: number of steps of the policy's observations."""
+"""Names of the fork's setting for the number of steps in the policy's observations."""
 ONE_STEP = ("env.num_one_step_observations", "env.num_single_obs", "env.num_one_step_obs")
-"""Settings: number of the policy's observations in one step."""
+"""Names of the fork's setting for the number of the policy's observations in one step."""
 
 NEAR = {
-    r"init_state\.(lin|ang)_vel$|env\.randomize_start_vel": "init_state.base_velocity is the range that it is drawn from",
+    r"init_state\.(lin|ang)_vel$|env\.randomize_start_vel": "init_state.base_velocity is the range of random velocities",
     r"env\.rand(omize)?_.*yaw|terrain\.yaw_init_range": "init_state.yaw",
     r"terrain\.[xy]_init_range|env\.rand(omize_start)?_y": "terrain.spawn_range",
     r"domain_rand\..*(delay|lag|latency)|sensor\..*latency": "control.actuator.delay [physics steps], observations.delay",
@@ -108,17 +108,17 @@ NEAR = {
     r"env\.(num_observations|num_privileged_obs)": "observations.groups",
     r"terrain\.(selected|terrain_kwargs|.*_kwargs)": "terrain.proportions and terrain.sizes choose types and their sizes",
     r"terrain\.restitution": "domain_rand.ranges.restitution",
-    r"terrain\.static_friction": "contacts have the friction of the robot's shapes here, averaged with it where it is mapped",
-    r"control\.use_actuator_network": "legged_gym's file is not read, and the robot's gains stand for it;"
-    " control.actuator.network names one that legged fit-actuator has fitted",
+    r"terrain\.static_friction": "the ground has no friction here; this value is averaged into domain_rand.friction_range",
+    r"control\.use_actuator_network": "legged_gym's network file is not read, and the robot's gains replace it;"
+    " control.actuator.network names a network from legged fit-actuator",
     r"asset\.fix_base_link": "the base of a legged robot floats here",
     r"asset\.disable_gravity": "gravity is never off",
     r"asset\.armature": "control.actuator.armature",
     r"asset\.dof_velocity_override": "velocity_limit of robot.yaml",
     r"asset\.(sdk_dof_range|collapse|.*_names?$)": "the robot's MJCF and robot.yaml",
-    r"sim\.gravity": "it is 9.81 m/s^2 downward",
+    r"sim\.gravity": "gravity is 9.81 m/s^2 downward",
     r"sim\.substeps": "sim.dt is the step of the physics",
-    r"runner\.(policy|algorithm)_class_name|runner_class_name": "networks and learner are those of train",
+    r"runner\.(policy|algorithm)_class_name|runner_class_name": "train.policy, train.algorithm: networks and learner",
 }
 """Pattern of a fork's setting -> the nearest setting of this package, or the reason why no setting is near."""
 MINOR = (
@@ -139,7 +139,7 @@ TERRAINS = [
     *(["slope_up", "slope_down"], ["rough_slope_down"], ["stairs_up"], ["stairs_down"]),
     *(["obstacles"], ["stepping_stones"], ["gap"], ["pit"]),
 ]
-"""Terrain types here of each entry of legged_gym's `terrain_proportions`."""
+"""Terrain types of this package for each entry of legged_gym's `terrain_proportions`."""
 TERRAIN_FUNCTIONS = {
     "": ["flat"] * 3,
     "pyramid_sloped_terrain": ["slope_up", "flat", "slope_down"],
@@ -148,8 +148,8 @@ TERRAIN_FUNCTIONS = {
     **{f"{name}_terrain": [name] * 3 for name in ("stepping_stones", "gap", "pit")},
     "discrete_obstacles_terrain": ["obstacles"] * 3,
 }
-"""Isaac Gym's terrain functions -> type here, for a negative, no, and a positive slope or height of steps. With a positive
-one the middle of a tile, where robots start, is its highest part.
+"""Isaac Gym's terrain functions -> terrain types of this package for a slope or step height that is negative, zero, and
+positive. If it is positive, the middle of a tile, where robots start, is the highest part.
 """
 
 PARTS = {
@@ -158,4 +158,4 @@ PARTS = {
     "dof_pos": {"self.dof_pos", "self.default_dof_pos"},
     "heights": {"torch.clip", "self.root_states[:, 2].unsqueeze", "1", "0.5", "self.measured_heights", "-1", "1.0"},
 }
-"""Observation term here -> names and numbers, but for scales, from which a fork computes the same."""
+"""Observation term of this package -> names and numbers in a fork's formula for the same values, without scales."""

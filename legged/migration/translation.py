@@ -15,7 +15,7 @@ from legged.migration.reading import Found
 
 DEFAULTS = to_dict(LeggedConfig())
 LIKE_DEFAULTS = {"commands.ranges.heading": [-3.14, 3.14], "train.runner.experiment_name": "test"}
-"""Path in this package -> default of legged_gym, which counts as equal to the default of this package."""
+"""Setting of this package -> legged_gym's default. It counts as equal to the default of this package."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Lost:
     setting: str
     value: str
     reason: str
-    """Reason, or the nearest setting of this package; empty if no setting is near."""
+    """Reason for the loss, or the nearest setting of this package; empty if no setting is near."""
 
     def __str__(self) -> str:
         value = f" = {self.value}" if self.value else ""
@@ -40,9 +40,9 @@ class Translation:
     theirs: dict[str, Found]
     """Settings of the environment and of the learner, by dotted path."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """Dotted path here -> value, where it differs from the default."""
+    """Dotted path in this package -> value that differs from the default."""
     comments: dict[str, str] = field(default_factory=dict)
-    """Dotted path here -> comment."""
+    """Dotted path in this package -> comment on the value."""
     lost: list[Lost] = field(default_factory=list)
     minor: list[str] = field(default_factory=list)
     """Paths of lost settings that change no task."""
@@ -52,8 +52,8 @@ class Translation:
     """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return a value of the file; `default` if it is not set or unknown. If the default is a float, a list or a table,
-        the value must be a number, a list of numbers, or a table of names and numbers. Any other value is recorded as lost.
+        """Return the fork's value of the setting `path`; `default` if it is not set or unknown. If `default` is a float, a
+        list or a table, the value must be a number, or a list or table of numbers; otherwise it is recorded as lost.
         """
         self.done.add(path)
         found, kind, fits = self.theirs.get(path), "", True
@@ -85,26 +85,26 @@ class Translation:
             self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path`, unless the value is the default. A value that the schema refuses is recorded as lost."""
+        """Set `path` to `value`, which comes from the fork's setting `theirs`. Record `theirs` as lost if it is refused."""
         self.done.add(theirs)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")
         except ConfigError as error:
             reason = str(error).removeprefix(f"value: {path}: ")
-            self.lose(theirs, f"{path} takes no such value: {reason}") if theirs in self.theirs else None
+            self.lose(theirs, f"{path} refuses this value: {reason}") if theirs in self.theirs else None
             return
         default = value_at(DEFAULTS, path)
         if default is None and path.startswith("observations.scales."):
             default = 1.0
         if value in (default, LIKE_DEFAULTS.get(path, default)):
-            self.settings.pop(path, None)  # remove the value from another setting of the file
+            self.settings.pop(path, None)  # another setting of the fork may have set it
             return
         self.settings[path] = copy.deepcopy(value)  # YAML would write a repeated list as an alias
         if comment:
             self.comments[path] = comment
 
     def take(self, table: Mapping[str, str]) -> None:
-        """Map the settings of a table that the file sets."""
+        """Map the fork's settings that are in `table`: path in the fork -> path in this package."""
         for theirs, ours in table.items():
             found = self.theirs.get(theirs)
             if found is not None and found.why_unknown:

@@ -1,4 +1,4 @@
-"""YAML text of a mapped task, with comments on its settings and the lost settings, and of a robot."""
+"""YAML texts of a migrated task and of its robot. Comments explain the task's settings and list the lost ones."""
 
 import dataclasses
 import textwrap
@@ -17,7 +17,7 @@ ORDER = list(dict.fromkeys((*FIRST, *(field.name for field in dataclasses.fields
 
 
 def task_yaml(head: Sequence[str], settings: Mapping[str, Any], comments: Mapping[str, str], lost: Iterable[str]) -> str:
-    """Return the file of a task: a head, comments on settings, the settings, and the lost ones as comments."""
+    """Return the text of a task's file: a head, comments on settings, the settings, and the lost settings as comments."""
     sections: dict[str, Any] = {}
     for path in sorted(settings, key=lambda path: ORDER.index(path.partition(".")[0])):
         merge(sections, nest(path, settings[path]), "", Origins())

@@ -20,7 +20,7 @@ from legged.process.paths import data_folder, exists, relative
 from legged.registry import YAML_ENDINGS, register_file, task_class, task_config, task_names
 
 OWN = ("task", "env.seed", "train.runner.run_name", "train.runner.experiment_name", "train.runner.stop_at")
-"""Settings that a sweep sets itself, so that its file must not."""
+"""Settings that the file of a sweep must not contain, because the sweep sets them."""
 EVALUATIONS = 10
 """Default number of evaluations of a trial."""
 NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
@@ -28,14 +28,14 @@ NUMBER = between(-FLOAT32_MAX, FLOAT32_MAX)
 
 @dataclass(frozen=True)
 class ParameterConfig:
-    """The tried values of a setting: a range or a list of choices."""
+    """Values that are tried for a setting: a range or a list of choices."""
 
     low: float | None = field(default=None, metadata=NUMBER)
     """Least value."""
     high: float | None = field(default=None, metadata=NUMBER)
     """Greatest value."""
     log: bool = False
-    """Draw from the logarithm of the range."""
+    """Sample uniformly on a logarithmic scale."""
     choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True, "unique": True})
     """Values to try, in place of a range."""
 
@@ -90,7 +90,7 @@ class Parameter:
     """Optuna's distribution: of whole numbers, of real numbers, or of choices as JSON texts."""
 
     def value(self, drawn: Any) -> Any:
-        """Return the value of the setting from a drawn number, rounded to four digits, or from the text of a choice."""
+        """Return the setting's value for a number that Optuna drew, rounded to four digits, or for the text of a choice."""
         if isinstance(drawn, str):
             return json.loads(drawn)
         if isinstance(drawn, int):
@@ -98,7 +98,7 @@ class Parameter:
         return min(max(float(f"{drawn:.4g}"), self.distribution.low), self.distribution.high)
 
     def drawn(self, value: Any) -> Any:
-        """Return the drawn number or text for a value of the setting; None if the value is not among those to try."""
+        """Return what Optuna would draw for a value of the setting; None if the value is not among those to try."""
         if hasattr(self.distribution, "choices"):
             return next((text for text in self.distribution.choices if json.loads(text) == value), None)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -127,12 +127,12 @@ class Plan:
 
     @property
     def own_drawn(self) -> dict[str, Any]:
-        """Dotted path -> drawn form of the task's own value; None if it is not among the values to try."""
+        """Dotted path -> `Parameter.drawn` of the task's own value, for each swept setting."""
         own = self.own
         return {one.path: one.drawn(own[one.path]) for one in self.parameters}
 
     def settings(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
-        """Return dotted path -> value of the settings of a trial, from the drawn numbers and texts."""
+        """Return dotted path -> value of a trial's settings. `drawn` has the numbers and texts that Optuna has drawn."""
         return {one.path: one.value(drawn[one.path]) for one in self.parameters if one.path in drawn}
 
     @property
@@ -152,8 +152,8 @@ class Plan:
 
     @property
     def negated(self) -> bool:
-        """True if intermediate figures are negated when they are reported. This is the case if trials' values are times, of
-        which less is better, while of the figure more is better.
+        """True if figures are reported to Optuna with the opposite sign. Optuna then minimises the time or the steps to a
+        target, but a larger figure is better.
         """
         return self.until_target and not lower_is_better(self.figure)
 
@@ -176,8 +176,8 @@ class Plan:
         )
 
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
-        """Return the arguments of `legged train` for trial `number`. They include evaluations, by which trials are compared.
-        They exclude report and film, because these take longer than many trials; `legged runs report` makes them later.
+        """Return the arguments of `legged train` for trial `number`. They switch on evaluations, to compare the trials.
+        They switch off report and film, because these take longer than many trials; `legged runs report` makes them later.
         """
         runner, target = self.cfg.train.runner, self.given.objective.target
         settings = {
@@ -194,7 +194,7 @@ class Plan:
         return [*flags, *(f"{path}={json.dumps(value)}" for path, value in settings.items())]
 
     def note(self, values: Mapping[str, Any], number: int) -> str:
-        """Return the note for the runs of a trial: its drawn values."""
+        """Return the note for the runs of a trial: the values of its settings."""
         drawn = [f"{'.'.join(path.split('.')[-2:])} {json.dumps(value)}" for path, value in values.items()]
         return f"trial {number} of {self.name}: {', '.join(drawn)}"
 
@@ -228,13 +228,13 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     if not is_plain_name(name):
         raise ConfigError(f"{path}: name: expected {PLAIN}; got {shown(name)}")
     if not given.task:
-        raise ConfigError(f"{path}: task: a sweep says which task it trains{suggest('', task_names(), 'tasks')}")
+        raise ConfigError(f"{path}: task: is missing; name the task to train{suggest('', task_names(), 'tasks')}")
     if not given.parameters:
-        raise ConfigError(f"{path}: parameters: a sweep tries the values of at least one setting")
+        raise ConfigError(f"{path}: parameters: is empty; name at least one setting and the values to try")
     for section in ("overrides", "parameters"):
         for key in getattr(given, section):
             if key in OWN or key.startswith(f"{OWN[-1]}."):
-                raise ConfigError(f"{path}: {section}: {key}: is set by the sweep itself (seeds, name, objective)")
+                raise ConfigError(f"{path}: {section}: {key}: leave it out; the sweep sets it (from seeds, name, objective)")
     named = relative(path.parent / given.task) if given.task.endswith(YAML_ENDINGS) else given.task
     task = register_file(named, f"{path}: task") if named.endswith(YAML_ENDINGS) else named
     with _said_in(path, "overrides"):
@@ -244,7 +244,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     if not runner.evaluate_interval:
         changes.append(("train.runner.evaluate_interval", max(1, runner.max_iterations // EVALUATIONS)))
     if "train.runner.evaluate_share" not in given.overrides:
-        changes.append(("train.runner.evaluate_share", 1.0))  # trials are compared at the same iterations
+        changes.append(("train.runner.evaluate_share", 1.0))  # skip no evaluation: trials are compared at equal iterations
     cfg = override(cfg, changes)
     parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())
     figures, objective = evaluated_figures(task_class(task), cfg), given.objective
@@ -253,7 +253,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
         known = suggest(figure, figures, "they find")
         raise ConfigError(f"{path}: objective.figure: evaluations of '{cfg.task}' find no {shown(figure)}{known}")
     if objective.take in ("time", "steps") and objective.target is None:
-        raise ConfigError(f"{path}: objective.target: the {objective.take} until what value of {figure}? Give a number")
+        raise ConfigError(f"{path}: objective.target: is missing; give the value of {figure} at which trials end")
     return Plan(name, given, cfg, figure, parameters, named)
 
 
@@ -264,7 +264,7 @@ def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> P
     where = f"{path}: parameters: {key}"
     if one.choices:
         if one.low is not None or one.high is not None or one.log:
-            raise ConfigError(f"{where}: choices take the place of low, high and log; give one or the other")
+            raise ConfigError(f"{where}: give either choices, or low and high with an optional log")
         _try(key, one.choices, cfg, path)
         return Parameter(key, CategoricalDistribution([json.dumps(value) for value in one.choices]))
     if one.low is None or one.high is None:

@@ -1,4 +1,4 @@
-"""The trials of a sweep in their storage: begun, handed to processes, taken back from processes that died, and reported."""
+"""The trials of a sweep in a storage that processes share, and the report on them."""
 
 import json
 import os
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
 JOURNAL = "journal:"
-"""Prefix of a storage that is a file of lines."""
+"""Prefix of a storage that is a journal file of Optuna."""
 BEAT_S = 10.0
 """Interval at which a process confirms that it works on its trial [s]."""
 GRACE_S = 120.0
@@ -50,10 +50,10 @@ class Trials:
     """The study of a sweep, shared by all processes that take part."""
 
     def __init__(self, plan: Plan, asked: str = "", worker: int = 0) -> None:
-        """Open the storage `asked`; if it is empty, the plan's storage; if that is empty too, sweep.db in the sweep's folder.
+        """Open the storage `asked`, or by default the storage that the plan names, or else sweep.db in the sweep's folder.
 
         Raises:
-            ConfigError: the storage holds another sweep of the same name, or the storage's name is invalid.
+            ConfigError: the storage holds another sweep of the same name, or the storage has an invalid name.
             RunError: the storage can't be reached.
         """
         import optuna
@@ -74,7 +74,7 @@ class Trials:
                 self.study.set_user_attr(SWEEP, plan.identity)
                 if None not in plan.own_drawn.values():
                     self.study.enqueue_trial(plan.own_drawn, skip_if_exists=True)
-        except Exception as error:  # SQLAlchemy, drivers and file systems raise their own classes
+        except Exception as error:  # SQLAlchemy, drivers and file systems raise errors of many classes
             raise RunError(f"sweep: the storage can't be used: {' '.join(str(error).split())[:300]}") from error
         if known not in (None, plan.identity):
             raise ConfigError(
@@ -83,7 +83,7 @@ class Trials:
             )
 
     def keep_to(self, device: str) -> None:
-        """Store the kind of device, cpu or cuda, with the first trial.
+        """At the first call, store the kind of device on which trials are trained, cpu or cuda. Later, compare with it.
 
         Raises:
             ConfigError: earlier trials were trained on the other kind.
@@ -127,12 +127,12 @@ class Trials:
         trial.set_user_attr(OWNER, me())
         earlier = [other for other in self._running() if other.number < trial.number]
         if len(self.finished) + len(earlier) >= wanted:
-            self.end(trial, "FAIL", "there were enough")
+            self.end(trial, "FAIL", "there were enough trials")
             return None
         return trial
 
     def end(self, trial: "Trial", state: str, why: str) -> None:
-        """End a trial that has no value: PRUNED if it was ended early, FAIL if it does not count."""
+        """End a trial that has no value. `state` is PRUNED if it was ended early, and FAIL if it does not count."""
         trial.set_user_attr(WHY, why)
         self.study.tell(trial, state=self._optuna.trial.TrialState[state])
 
@@ -213,7 +213,7 @@ def _pruner(plan: Plan) -> Any:
     most = runner.max_iterations * len(plan.given.seeds)
     if plan.given.pruner == "hyperband":
         return HyperbandPruner(min_resource=runner.evaluate_interval, max_resource=most, reduction_factor=3)
-    # Early figures say little, so a trial may run for a quarter of its length.
+    # Early figures say little, so no trial is ended in the first quarter of its iterations.
     median = MedianPruner(n_startup_trials=5, n_warmup_steps=runner.max_iterations // 4)
     return NopPruner() if plan.given.pruner == "none" else median
 
@@ -224,8 +224,8 @@ def me() -> str:
 
 
 def is_dead(owner: str | None, said: float | None) -> bool:
-    """Return True if the process of a trial has died. A process of this machine has died if it does not exist; one of another
-    machine, if its last confirmation `said` [s since 1970] is too old.
+    """Return True if the process of a trial has died. A process of this machine has died if it does not exist. A process of
+    another machine counts as dead if its last confirmation, at the time `said` [s since 1970], is too old.
     """
     parts = (owner or "").rsplit(" ", 2)
     if len(parts) == 3 and parts[0] == _machine() and parts[1].isdecimal():
@@ -339,7 +339,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
         parts += ["and on the command line:", f"```\n{shlex.join(words)}\n```"]
         if plan.given.overrides:
             common = ", ".join(f"`{path}={_text(value)}`" for path, value in plan.given.overrides.items())
-            parts.append(f"Neither holds the overrides of all trials: {common}.")
+            parts.append(f"Add the overrides that all trials share: {common}.")
     return "\n\n".join(parts) + "\n"
 
 

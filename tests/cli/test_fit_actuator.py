@@ -45,7 +45,9 @@ def test_a_peak_of_the_friction_that_the_log_does_not_show_is_not_invented(tmp_p
     assert drive.viscous == pytest.approx(TRUTH["viscous"], rel=0.05)
     flags = ["--updates", "5", "--out", "fit", "--longest-delay", "0.01"]
     assert fit_actuator.main([str(tmp_path / "log.npz"), *flags]) == 0
-    assert re.search(r"friction: 1\.\d+ N m \(the log shows no more to break away\), viscous 0\.2", capsys.readouterr().out)
+    assert re.search(
+        r"friction: 1\.\d+ N m \(the log shows no higher breakaway torque\), viscous 0\.2", capsys.readouterr().out
+    )
 
 
 @pytest.mark.slow

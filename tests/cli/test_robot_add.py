@@ -286,7 +286,7 @@ def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force
     (tmp_path / "go/meshes/cube.obj").write_text(cube)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     assert call(add.main, ["go/go.xml", "--out", ".", *force]) == 2
-    assert "go/go.xml: is in go, which would be written over; give another --name or --out" in capsys.readouterr().err
+    assert "go/go.xml: the new robot would overwrite its folder go; give another --name or --out" in capsys.readouterr().err
     assert call(add.main, ["go.urdf", "--out", ".", *force]) == 2
     message = "go/meshes/cube.obj: is in go, which" if force else "go exists already"
     assert message in capsys.readouterr().err

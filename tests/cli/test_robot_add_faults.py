@@ -147,10 +147,10 @@ def test_counts_are_of_after_the_feet_were_fitted(added, tmp_path):
 def test_gains_are_raised_until_the_robot_stands(added):
     """The rule's gains let this one sink to three quarters: its light shanks limit them."""
     out = added(XML.format(head="", legs=LEGS), "--name", "sinker", file="toy.xml")
-    assert "times the rule's, with which in C MuJoCo the base sinks from " in out
+    assert "times the rule's. With the rule's in C MuJoCo the base sinks from " in out
     robot = load_robot("mine/sinker")
     assert height_under_gains(robot, robot.stiffness, robot.damping) > 0.84 * robot.height
     out = added(XML.format(head="", legs=LEGS), "--name", "soft", "--stiffness", "5", "--damping", "0.3", file="toy.xml")
     assert "in C MuJoCo the base sinks from " in out
-    assert "look at the gains" in out
+    assert "check the gains" in out
     assert "times the rule's" not in out

@@ -141,7 +141,7 @@ def test_only_sizes_of_all_seeds_are_compared(tmp_path):
         (["nowhere"], "nowhere: holds no evaluation_<physics>.json"),
         (["other.json"], "other.json: is not the result of an evaluation"),
         (["good.json", "--types", "stair_up"], "stair_up: none of the evaluations holds it; did you mean 'stairs_up'"),
-        (["flat.json", "--out", "x"], "--out: draws success against difficulty, which none"),
+        (["flat.json", "--out", "x"], "--out: there is nothing to draw"),
     ],
 )
 def test_wrong_input_is_named(arguments, message, tmp_path, monkeypatch, capsys):

@@ -394,7 +394,7 @@ def test_runs_are_named_as_in_other_tools(capsys):
         (["nowhere"], "error: RUN: there is no task and no run 'nowhere'"),
         (["anymal_cc"], "error: RUN: there is no task and no run 'anymal_cc'; did you mean 'anymal_c'?"),
         ([TASK], f"error: RUN: '{TASK}' has no run in logs/"),
-        (["x", "--checkpoint", "5"], "error: --checkpoint: 5: chooses the policy to film"),
+        (["x", "--checkpoint", "5"], "error: --checkpoint: 5: has no effect without --film"),
         (["RUN", "--note", " "], "error: --note: expected a sentence of at most 1000 letters, got 0"),
     ],
 )

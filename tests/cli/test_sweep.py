@@ -82,7 +82,7 @@ def states(trials: Trials) -> list[str]:
         ({"task": "half_cheeta"}, "mine.yaml: task: there is no task 'half_cheeta'; did you mean 'half_cheetah'?"),
         ({"task": "half_cheeta.yaml"}, "mine.yaml: task: there is no file 'half_cheeta.yaml'"),
         ({"trials": 0}, "mine.yaml: trials: must be at least 1, got 0"),
-        ({"parameters": {}}, "mine.yaml: parameters: a sweep tries the values of at least one setting"),
+        ({"parameters": {}}, "mine.yaml: parameters: is empty; name at least one setting"),
         (
             {"parameters": {"train.algorithm.lerning_rate": {"low": 0.1, "high": 0.2}}},
             "mine.yaml: parameters: train.algorithm.lerning_rate: unknown key 'lerning_rate'; did you mean 'learning_rate'?",
@@ -109,10 +109,10 @@ def states(trials: Trials) -> list[str]:
             {"parameters": {"train.algorithm.num_learning_epochs": {"low": 1.5, "high": 3}}},
             "expected whole numbers for low and high, got 1.5 and 3",
         ),
-        ({"parameters": {"env.seed": {"low": 1, "high": 3}}}, "parameters: env.seed: is set by the sweep itself"),
+        ({"parameters": {"env.seed": {"low": 1, "high": 3}}}, "parameters: env.seed: leave it out; the sweep sets it"),
         ({"overrides": {"env.num_env": 3}}, "mine.yaml: overrides: env.num_env: unknown key 'num_env'"),
         ({"objective": {"figure": "reward"}}, "objective.figure: evaluations of 'half_cheetah' find no 'reward'"),
-        ({"objective": {"take": "time"}}, "objective.target: the time until what value of return?"),
+        ({"objective": {"take": "time"}}, "objective.target: is missing; give the value of return"),
         ({"storage": "somewhere"}, "storage: 'somewhere' is no storage; expected sqlite:///<file>"),
     ],
 )

@@ -93,7 +93,7 @@ def test_rewards_terminations_actions_and_joints_of_a_legged_robot():
             "# robot: go2, 15.02 kg, 0.324 m high; numbers written for anymal_c are rescaled: masses x 0.288,"
             " lengths x 0.589, times x 0.768",
         ),
-        ("anymal_c", "# robot: anymal_c, 52.13 kg, 0.549 m high; numbers are written for it"),
+        ("anymal_c", "# robot: anymal_c, 52.13 kg, 0.549 m high; its settings are written for this robot"),
     ],
 )
 def test_by_what_numbers_were_carried_to_the_robot(task, expected):

@@ -92,9 +92,9 @@ LOST = [
     (
         "control",
         "action_scale = -1.",
-        "control.action_scale = -1.0: control.action_scale takes no such value: must be above 0",
+        "control.action_scale = -1.0: control.action_scale refuses this value: must be above 0",
     ),
-    ("rewards", "max_contact_force = 'x'", "rewards.max_contact_force = 'x': rewards.max_contact_force takes no such value"),
+    ("rewards", "max_contact_force = 'x'", "rewards.max_contact_force = 'x': rewards.max_contact_force refuses this value"),
     ("init_state", "rot = [0., 0., 1., 0.]", "init_state.rot = [0.0, 0.0, 1.0, 0.0]: robots start level"),
 ]
 
@@ -181,7 +181,7 @@ def test_joints_without_gains_have_none_and_are_listed(migrated):
     result = migrated(sections(control="stiffness = {'HAA': 30., 'HFE': 30.}\ndamping = {'H': 1., 'KFE': 1.}"))
     assert result.data["control"]["stiffness"]["LF_KFE"] == 0.0
     (lost,) = result.lost
-    assert "says nothing of LF_KFE, RF_KFE, LH_KFE, RH_KFE; legged_gym gives such joints none" in lost
+    assert "has no value for LF_KFE, RF_KFE, LH_KFE, RH_KFE; legged_gym then uses 0" in lost
 
 
 def test_what_is_known_of_legged_gym_is_complete():

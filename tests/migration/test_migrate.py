@@ -56,7 +56,9 @@ def test_legged_gyms_flat_anymal(migrated):
         },
     }
     (lost,) = result.lost
-    assert lost.startswith("legged_gym's AnymalCRoughCfg: control.use_actuator_network = True: legged_gym's file is not read")
+    assert lost.startswith(
+        "legged_gym's AnymalCRoughCfg: control.use_actuator_network = True: legged_gym's network file is not read"
+    )
     task = built(result)
     assert task.control.stiffness.tolist() == [90.0] * 12  # the robot's own stand for the network
 
@@ -151,7 +153,7 @@ def test_a_fork_with_history_computed_values_and_rewards_of_its_own(migrated):
 @pytest.mark.slow
 def test_mixins_and_a_base_of_the_forks_own(migrated, refused):
     written(OUR_BASE, "pkg/base_config.py")
-    assert "pkg/mixed.py has several configurations, say which (--task: " in refused(written(MIXINS, "pkg/mixed.py"))
+    assert "pkg/mixed.py has several configurations; name one (--task: " in refused(written(MIXINS, "pkg/mixed.py"))
     assert "did you mean 'MixedCfg'?" in refused("pkg/mixed.py", "--task", "MixdCfg")
     result = migrated(MIXINS, "--task", "MixedCfg", "--out", "tasks", path="pkg/mixed.py")
     assert result.path == Path("tasks/mixed.yaml")
@@ -164,7 +166,7 @@ def test_mixins_and_a_base_of_the_forks_own(migrated, refused):
     assert set(shares) in ({"slope_up", "obstacles", "stepping_stones", "gap", "pit"}, {"slope_down", *list(shares)[1:]})
     assert sum(shares.values()) == pytest.approx(1.0)
     assert shares["obstacles"] == pytest.approx(0.5 / 0.9, abs=2e-4)
-    assert any("not here or too large: entry 9, entry 10" in line for line in result.lost)
+    assert any("unknown here, or too large for the tiles: entry 9, entry 10" in line for line in result.lost)
     task = built(result, ("terrain.border_size", 5.0))
     assert task.robot.file.spawn_height == 0.7
 
@@ -176,7 +178,7 @@ def test_a_task_may_be_asked_for_by_the_name_that_it_is_registered_by(migrated, 
     assert call(migrate.main, ["fork/envs/__init__.py", "--task", "a_walks", "--run"]) == 0
     capsys.readouterr()
     assert "sim" not in read_yaml(Path("a_walks.yaml"))
-    assert "it registers tasks: --task (tasks: a_walks, b_walks)" in refused("fork/envs/__init__.py")
+    assert "choose a registered task: --task (tasks: a_walks, b_walks)" in refused("fork/envs/__init__.py")
     assert "(--task: ACfg, BCfg, a_walks, b_walks)" in refused("fork/envs/mine/config.py")
 
 
