@@ -1,7 +1,8 @@
 """Base class of all tasks: the loop of a Markov decision process on batched physics, behind rsl-rl's interface.
 
-Terms are methods: `_obs_<name>`, `_reward_<name>`, `_terminate_<name>`, `_metric_<name>`. Those that the configuration names
-run. All tensors have N rows, one per environment, and stay at their addresses, so that a step is one CUDA graph.
+Terms are methods. The configuration names the `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that run; every
+`_metric_<name>` runs. All tensors have N rows, one for each environment, and fixed addresses, so that a step is one CUDA
+graph.
 """
 
 from abc import abstractmethod
@@ -36,22 +37,22 @@ from legged.process.ranks import Ranks
 
 class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     """N environments on one device. A subclass defines the world (`make_scene`), the initial states of episodes
-    (`draw_reset`) and the terms. All other methods of `_step` are hooks with a default.
+    (`draw_reset`) and the terms. All other public methods that a step calls (see `_step`) are hooks with a default.
     """
 
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """Schema of the task's configuration."""
     QUANTITIES: ClassVar[tuple[str, ...]] = ()
-    """Arrays of MuJoCo's data, in addition to qpos and qvel, that terms read by `self.physics.quantity(name)`."""
+    """Names of arrays in MuJoCo's data, in addition to qpos and qvel, that terms read by `self.physics.quantity(name)`."""
     OWN_HELPERS: ClassVar[tuple[str, ...]] = ()
-    """Methods with the name of another framework's hook that a subclass calls itself. Without this entry the name is an
-    error, because BaseTask never calls that hook (legged/envs/class_checks.py)."""
+    """Names of methods that a subclass calls itself although another framework has a hook of that name. BaseTask never calls
+    such a hook, so a method with its name must be listed here (legged/envs/class_checks.py)."""
 
     def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
-        """Build physics and terms on `device`; with `graph`, the step is captured on a GPU.
+        """Build physics and terms on `device`. With `graph`, the step is captured in a CUDA graph if `device` is a GPU.
 
         Raises:
-            ConfigError: the configuration names something that does not exist. Nothing has been compiled yet.
+            ConfigError: the configuration or the task class is invalid.
             TermError: a term fails or cannot be captured.
         """
         self.check(cfg)
@@ -65,7 +66,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Control step [s]."""
         self.max_episode_length = round(cfg.env.episode_length_s / cfg.dt)
         """Steps of a full episode."""
-        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # each GPU simulates other robots, on the same ground
+        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # each GPU draws other numbers; the terrain is the same
         self.randomization = self.make_randomization()
         self._build_physics(self.make_scene())
         self.num_actions = self.physics.ctrl.shape[1]
@@ -76,7 +77,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
         self._collect_terms()
         self.numbers.allocate()
-        # On a GPU, the step of an engine that can't be captured runs eagerly. On the CPU the step is only checked.
+        # On a GPU, the step runs eagerly if the engine can't be captured. On the CPU the step is only checked.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
 
     @classmethod
@@ -95,7 +96,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     @abstractmethod
     def make_scene(self) -> Scene:
-        """Return the scene that each world consists of."""
+        """Return the scene of one world; all N worlds have the same scene."""
 
     def _allocate(self) -> None:
         """Allocate the tensors that every task has. D is the number of actions."""
@@ -109,7 +110,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.terminated_buf = torch.zeros(n, dtype=torch.bool, device=device)
         """(N,) True if the episode ended in a failure."""
         self.time_out_buf = torch.zeros_like(self.terminated_buf)
-        """(N,) True if the episode ended by a time-out; the learner bootstraps its value."""
+        """(N,) True if the episode ended by a time-out; the learner then bootstraps with the value function."""
         self.reset_buf = torch.zeros_like(self.terminated_buf)
         """(N,) True if the episode ended, by failure or time-out."""
         self.valid = torch.ones_like(self.terminated_buf)
@@ -136,13 +137,13 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.numbers = RandomPool(n, device)  # type: ignore[arg-type]
         """Pool of the random numbers of a step. Subclasses reserve columns in `_init_buffers`."""
         self.step_watcher: StepWatcher | None = None
-        """Watcher that copies the end of each step before episodes are reset; set by `final_observation.watch_steps`."""
+        """Watcher that copies tensors in each step, before episodes are reset; `final_observation.watch_steps` sets it."""
         self._steps_since_log = 0
         self._has_buffers = False
 
     def _init_buffers(self) -> None:
-        """Hook: allocate a subclass' own tensors and parts. It is called after the physics is built and before any term runs.
-        Overrides must call super()._init_buffers().
+        """Hook: allocate a subclass's own tensors and parts. The hook is called after the physics is built and before terms
+        run. Overrides must call super()._init_buffers().
         """
         self._has_buffers = True
 
@@ -159,7 +160,6 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.nan_guard = NanGuard(self.rewards.names, self.observation_terms, self.num_envs, self.device)  # type: ignore[arg-type]
 
     def _methods(self, prefix: str, names: Any) -> dict[str, Callable[[], Tensor]]:
-        """Return the methods `<prefix><name>` by name."""
         return {name: getattr(self, prefix + name) for name in names}
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
@@ -171,7 +171,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         with ordinary_tensors():
             before = self.state_dict()
             self._graph = StepGraph(self._step, self.device, enabled)  # type: ignore[arg-type]
-            # Undo the trial steps, but keep the buffers that terms allocated at their first call.
+            # Undo the trial steps of StepGraph, but keep the buffers that terms allocated at their first call.
             now = self.state_dict()
             self.load_state_dict({part: {**state, **before[part]} for part, state in now.items()})
             self.reset_curricula()
@@ -180,7 +180,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     # ---- one control step --------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Make one control step from `_action_input` to all buffers, without reads by the host or new addresses."""
+        """Make one control step with `_action_input`. To fit a CUDA graph, it reads nothing on the host."""
         self.take_actions()
         for _ in range(self.cfg.control.decimation):
             self.apply_control()
@@ -232,8 +232,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Hook: update `physics.ctrl` before each physics step, for control laws that run faster than the policy."""
 
     def draw(self) -> None:
-        """Hook: draw the noise of the step and an initial state for every environment. Only environments that are reset use
-        it. The hook runs on a parallel stream of the step.
+        """Hook: draw the random numbers of the step, and an initial state for every environment, which is used only if the
+        environment is reset. The hook runs in parallel with other parts of the step, on another stream.
         """
         self.numbers.draw()
         self.randomization.draw()
@@ -241,8 +241,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     @abstractmethod
     def draw_reset(self) -> None:
-        """Write an initial state for every environment to `reset_qpos` and `reset_qvel`. When this runs, `numbers` have just
-        been drawn.
+        """Write an initial state for every environment to `reset_qpos` and `reset_qvel`. Before each call, the pool `numbers`
+        has drawn new random numbers.
         """
 
     def sense(self) -> None:
@@ -250,7 +250,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.physics.refresh()
 
     def advance(self) -> None:
-        """Hook: advance all counters of time by a control step."""
+        """Hook: advance counters of time, such as `episode_length_buf`, by a control step."""
         self.episode_length_buf.add_(1)
 
     @concurrent
@@ -258,7 +258,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Hook: determine which episodes end: by a term, by time, or because the physics has diverged."""
         state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
-        torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # NaN compares False, so it counts as out of bounds
+        torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # NaN < x is False, so NaN counts as out of bounds
         torch.logical_and(self._in_bounds, self.nan_guard.outputs_finite, out=self.valid)
         self._concurrent_terminations.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
@@ -280,15 +280,15 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.forget(mask)
 
     def forget(self, mask: Tensor) -> None:
-        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. The hook runs at the same time as
-        `redraw`, so it must not read randomised properties. `reset_idx` may read them, after super().reset_idx(mask).
+        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. `redraw` runs at the same time,
+        so this hook must not read randomised properties. `reset_idx` may read them after super().reset_idx(mask).
         """
         self.rewards.reset(mask)
         masked_set_(self.actions, mask, 0.0)
         masked_set_(self.episode_length_buf, mask, 0)
 
     def disturb(self, mask: Tensor) -> None:
-        """Hook: disturb the environments of `mask` (N,), whose episodes continue."""
+        """Hook: disturb environments, for example by pushes. `mask` (N,) is True where the episode continues."""
 
     def ask(self) -> None:
         """Hook: update commands. `reset_buf` marks new episodes."""
@@ -304,14 +304,14 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             group.restart(self.reset_buf)
 
     def remember(self) -> None:
-        """Hook: store the values of this step that the next one compares with."""
+        """Hook: store values of this step, such as the actions, for terms that compare the next step with this one."""
         self.last_actions.copy_(self.actions)
 
     # ---- rsl-rl's interface ------------------------------------------------------------------------------------------
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """(N,) control steps since the episode began. An assignment copies, so that the tensor keeps its address."""
+        """(N,) control steps since the episode began. An assignment copies values, so that the tensor keeps its address."""
         return self._episode_length
 
     @episode_length_buf.setter
@@ -376,12 +376,12 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Return the mirror images of observations and actions; None if the task has no mirror image.
 
         Raises:
-            ConfigError: the number of a term's columns does not fit its kind in `MIRRORED`.
+            ConfigError: `MIRRORED` has no kind for a term, or a kind that does not fit the term's number of columns.
         """
         return None
 
     def log_rollout(self) -> dict[str, Tensor]:
-        """Return the figures that are logged of a rollout, as fresh 0-dimensional tensors by name in TensorBoard."""
+        """Return the last rollout's figures for the log, by name in TensorBoard, as new 0-dimensional tensors."""
         return {**self.metrics.flush(), **self.nan_guard.flush()}
 
     def reset_curricula(self) -> None:

@@ -15,13 +15,13 @@ from legged.physics.quantities import LAST_STEP, STAGES
 RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
 """Names of metrics that every task logs."""
 FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
-"""Figures of evaluations during training, for robots that follow commands. The first one chooses the best policy by
-default.
+"""Figures that evaluations during training report for robots that follow commands. By default, the first one decides which
+policy is the best.
 """
 RETURNING = ("return", "falls", "episode_length")
-"""Figures of evaluations during training, for tasks without commands. The first one chooses the best policy by default."""
+"""The same as FOLLOWING for tasks without commands."""
 MOST_IN_A_POOL = 2**31 - 1
-"""Largest number of contacts, or of constraint rows, of all robots. Engines count them in 32 bits."""
+"""Largest number of contacts, or of constraint rows, summed over all robots. Engines count them with 32-bit integers."""
 MOST_SAMPLES = 2**28
 """Largest number of samples in an iteration."""
 MOST_WEIGHTS = 2**30
@@ -59,15 +59,15 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
 
 
 def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
-    """Return the names of the figures of evaluations during training, for a task of class `cls`: first the standard figures,
-    then the task's metrics. The first figure chooses the best policy, unless train.runner.best_by names another.
+    """Return the names of the figures that evaluations during training report for a task of class `cls`: the standard
+    figures, then its metrics. The first one decides which policy is best, unless train.runner.best_by names another.
     """
     first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
     return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]
 
 
 def lower_is_better(figure: str) -> bool:
-    """Return whether a figure of an evaluation is an error or a share of falls."""
+    """Return True if smaller values of a figure are better: for errors and for the share of falls."""
     return figure.endswith("_rmse") or figure == "falls"
 
 
@@ -75,8 +75,8 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     """Check the settings of evaluations during training.
 
     Raises:
-        ConfigError: a named figure does not exist, stop_at is set without evaluations, or an evaluation is shorter
-            than a control step.
+        ConfigError: best_by or stop_at names an unknown figure, stop_at is set but evaluate_interval is not, or an evaluation
+            is shorter than a control step.
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
     asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}
@@ -117,7 +117,7 @@ def check_lengths(cfg: TaskConfig) -> None:
 
 
 def check_sizes(cfg: TaskConfig) -> None:
-    """Check that the sizes of allocations for all robots stay below MOST_IN_A_POOL, MOST_SAMPLES and MOST_WEIGHTS.
+    """Check that contacts, samples and weights do not exceed MOST_IN_A_POOL, MOST_SAMPLES and MOST_WEIGHTS.
 
     Raises:
         ConfigError: a size is too large.
@@ -148,13 +148,13 @@ def check_sizes(cfg: TaskConfig) -> None:
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Check that every observation in `used` has a valid kind in `mirrored`, which is the table MIRRORED of the class `task`.
-    Error messages begin with `where`.
+    """Check that every observation in `used` has a valid kind in `mirrored`, the table MIRRORED of the task's class. `task`
+    is the name of this class. Error messages begin with `where`.
 
     Raises:
         ConfigError: an observation has no kind, or an unknown one.
     """
-    otherwise = "false learns without mirror images"
+    otherwise = "train.algorithm.symmetry=false learns without mirror images"
     kinds = get_args(MirrorKind)
     for name in used:
         if name not in mirrored:

@@ -14,12 +14,12 @@ from legged.errors import ConfigError, suggest
 from legged.process.paths import relative
 
 _OBSERVE = "write a method _obs_<name> for each part and list the names in observations.groups.actor.terms and .critic.terms"
-_STEP = "override one of the hooks that _step() calls, and call super()'s in it: advance, compute_reward, remember, ..."
+_STEP = "override one of the hooks that _step() calls, calling super()'s: advance, compute_reward, remember, ..."
 _START = (
     "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for more, override"
     " reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
 )
-_BUILD = "the robot is its MJCF (robot: in the task's YAML), the ground is terrain: or what make_terrain() returns"
+_BUILD = "robot: in the task's YAML names the robot, terrain: describes the ground (or override make_terrain())"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 _TORQUES = "control.control_type, control.stiffness and control.damping set the law; other laws go into legged/mdp/control.py"
 _RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
@@ -32,25 +32,25 @@ HOOKS = {
     "_post_physics_step_callback": _STEP,
     "compute_observations": _OBSERVE,
     "get_privileged_observations": "observations.groups.critic.terms lists the _obs_<name> methods that the critic sees",
-    "_get_noise_scale_vec": "observations.noise in the YAML gives each term's noise; observations.add_noise, noise_level",
+    "_get_noise_scale_vec": "observations.noise, noise_level and observations.add_noise in the YAML set the noise",
     "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share set the"
     " sampling; another way of sampling goes into legged/mdp/commands.py",
     "_compute_torques": _TORQUES,
     "_reset_dofs": _START,
     "_reset_root_states": _START,
     "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy set the pushes",
-    "_update_terrain_curriculum": "terrain.curriculum switches it; another one goes into legged/mdp/terrain_curriculum.py",
-    "update_command_curriculum": "commands.curriculum sets it; another one goes into legged/mdp/command_curriculum.py",
-    "_get_heights": "self.measured_heights (N, P) has them after every step; terrain.measured_points_x and _y set the points",
+    "_update_terrain_curriculum": "terrain.curriculum switches it on; other rules go into legged/mdp/terrain_curriculum.py",
+    "update_command_curriculum": "commands.curriculum configures it; other rules go into legged/mdp/command_curriculum.py",
+    "_get_heights": "self.measured_heights (N, P) is current after a step; terrain.measured_points_x and _y set the points",
     "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y set the points of the height scan",
-    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range randomise; the MJCF has the rest",
-    "_process_dof_props": "joint limits and efforts are the MJCF's, velocity limits robot.yaml's; rewards.soft_* shrink them",
-    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range randomise; the MJCF has the rest",
+    "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range set friction; all else is in the MJCF",
+    "_process_dof_props": "the MJCF has joint limits and efforts, robot.yaml velocity limits; rewards.soft_* shrink limits",
+    "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range add mass; all else is in the MJCF",
     "_create_envs": _BUILD,
     "_create_ground_plane": _BUILD,
     "_create_heightfield": _BUILD,
     "_create_trimesh": _BUILD,
-    "_get_env_origins": "self.env_origins (N, 3) are the terrain's; terrain.spawn_range scatters robots around them",
+    "_get_env_origins": "self.env_origins (N, 3) come from the terrain; terrain.spawn_range scatters robots around them",
     "create_sim": _BUILD,
     "_reset_buffers": _STEP,
     "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) exist already; allocate your own buffers in _init_buffers()",
@@ -58,13 +58,13 @@ HOOKS = {
     "compute_self_observations": _OBSERVE,
     "compute_termination_observations": "keep_final_step(task) keeps the final observations of episodes"
     " (legged/envs/final_observation.py)",
-    "_disturbance_robots": "domain_rand.forces and kicks push robots; for other disturbances override disturb(mask), with"
-    " self.physics.push",
+    "_disturbance_robots": "domain_rand.forces and kicks push robots; for other disturbances override disturb(mask) and"
+    " call self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
     "_call_train_eval": _STEP,
     "_randomize_dof_props": _RANDOM,
     "_randomize_rigid_body_props": _RANDOM,
-    "_randomize_gravity": "domain_rand.ranges.gravity_x, _y and _z are added to it (docs/randomisation.md)",
+    "_randomize_gravity": "domain_rand.ranges.gravity_x, _y and _z are added to gravity (docs/randomisation.md)",
     "refresh_actor_rigid_shape_props": _RANDOM,
     "_draw_debug_vis": _DRAWING,
     "render": _DRAWING,
@@ -78,12 +78,12 @@ HOOKS = {
     "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
     "_reset_idx": "override reset_idx(mask), with one bool per robot",
 }
-"""Hook of another framework -> its replacement here."""
+"""Hook of another framework -> hint at its replacement in this package."""
 OUTSIDE = {
-    "step": "training runs _step() as a CUDA graph, without it; override the hooks of _step(), and call super()'s in them",
-    "get_observations": "training reads the groups' buffers, without it; " + _OBSERVE,
+    "step": "training runs _step() as a CUDA graph, not step(); override hooks of _step(), and call super()'s in them",
+    "get_observations": "training does not call it, but reads the groups' buffers; " + _OBSERVE,
 }
-"""Method of a task that only play and evaluation call -> methods to override instead."""
+"""Method that play and evaluation call, but training does not -> hint at what to override instead."""
 
 EXTENDED = {
     "advance": "otherwise episode_length_buf and self.contacts would stand still",
@@ -98,12 +98,11 @@ EXTENDED = {
 
 
 def check_overrides(cls: type) -> None:
-    """Check the methods of a task class, and those of its parents up to a class of this package.
+    """Check the methods of a user's task class, and of its parents that do not belong to this package.
 
     Raises:
-        ConfigError: a method has the name of another framework's hook, or of a method that training does not call, and
-            OWN_HELPERS does not list it; an override does not call super()'s method; or a constructor takes other arguments
-            than (self, cfg, device, graph).
+        ConfigError: training would never call a method, and OWN_HELPERS does not list it; an override of a hook in EXTENDED
+            does not call super()'s method; or a constructor takes other arguments than (self, cfg, device, graph).
     """
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
@@ -118,7 +117,7 @@ def check_overrides(cls: type) -> None:
             vain = f"would not act: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
             raise ConfigError(
                 f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
-                f" (if your own code calls it: OWN_HELPERS = ('{name}',) in the class)"
+                f" (if your own code calls it, write OWN_HELPERS = ('{name}',) in the class)"
             )
         for name in EXTENDED:
             code = getattr(inspect.unwrap(vars(part).get(name, check_overrides)), "__code__", None)
@@ -148,14 +147,14 @@ def _check_constructor(part: type) -> None:
     except TypeError as error:
         raise ConfigError(
             f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), as tasks here do"
-            f" ({error}); there are no arguments of Isaac Gym, and buffers are allocated in _init_buffers()"
+            f" ({error}); it gets no arguments of Isaac Gym; allocate buffers in _init_buffers()"
         ) from error
     except ValueError:  # the constructor has no signature
         return
 
 
 KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}
-"""Prefix of a term's method -> word for it in errors."""
+"""Prefix of a term's method -> word for the term in error messages."""
 
 
 def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
@@ -192,7 +191,7 @@ def check_terms(cls: Any, cfg: TaskConfig) -> None:
 
 
 def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
-    """Check the method `name` of a term that the setting at `path` names.
+    """Check the method `name` of a term. `path` is the dotted path of the setting that names the term.
 
     Raises:
         ConfigError: the term is not a method, or takes arguments.
@@ -201,14 +200,13 @@ def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
     where = f"{origins.where(path)}: {cls.__name__}.{name}"
     if isinstance(found, property) or not callable(getattr(cls, name)):
         raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
-    # In `parameters`, only a plain method still has its first argument: a static method has none, and a classmethod's is
-    # bound.
+    # `signature` shows `self` only for a plain method: a static method has none, and the class of a class method is bound.
     bound = isinstance(found, classmethod | staticmethod)
     parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
     needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     takes_self = bool(parameters) and parameters[0].kind is not parameters[0].KEYWORD_ONLY
     if not bound and not takes_self:
-        raise ConfigError(f"{where} takes no self; a term is a method without other arguments")
+        raise ConfigError(f"{where} takes no self; a term is a method with self as its only argument")
     if needed[0 if bound else 1 :]:
         listed = ", ".join(needed[0 if bound else 1 :])
         raise ConfigError(f"{where} takes arguments ({listed}); a term takes only self, and reads the task's tensors")

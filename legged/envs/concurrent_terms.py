@@ -14,13 +14,13 @@ Function = Callable[[], Tensor]
 class ConcurrentTerms:
     """Terms that run at the same time as `check_termination`, on several streams. On the CPU they run one after the other.
 
-    On a GPU, a term is a few short launches, and most of their time is waiting for each other. One after the other, the
-    rewards of a quadruped take a tenth of a step. On parallel streams they take almost no time.
+    On a GPU, a term is a few short launches, which mostly wait for each other. One after the other, the rewards of a
+    quadruped take a tenth of a step. On parallel streams they add almost no time to the step.
     """
 
     def __init__(self, device: torch.device, streams: int, settled: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Create the `streams` that terms are distributed over. With 0 streams every term runs when it is called. `settled`
-        returns, by name, the tensors that other code writes at the same time. Terms on the streams must not read them.
+        """Distribute terms over `streams` CUDA streams. With 0 streams every term runs when it is called. `settled` returns,
+        by name, the tensors that other code writes at the same time. Terms on the streams must not read these.
         """
         self._branches = [Branch(device) for _ in range(streams)]
         self._functions: list[dict[str, Function]] = [{} for _ in range(streams)]
@@ -44,11 +44,10 @@ class ConcurrentTerms:
         return lambda: self._values.pop(term) if term in self._values else function()
 
     def start(self) -> None:
-        """Start the evaluation of all terms from the current state. It runs at the same time as the following code, up to
-        `join`.
+        """Start to evaluate all terms from the current state, at the same time as the code between this call and `join`.
 
         Raises:
-            TermError: at the first call, if a term reads a tensor of `settled`.
+            TermError: a term reads a tensor of `settled`. Only the first call checks this.
         """
         for branch, functions in zip(self._branches, self._functions, strict=True):
             if functions:

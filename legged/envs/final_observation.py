@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class StepWatcher(Protocol):
-    """Watcher of a task, which is called in each step when rewards are computed, before any environment is reset, pushed or
-    given a new command.
+    """Watcher of a task. Each step calls it after rewards are computed and before any environment is reset, pushed or given a
+    new command.
     """
 
     def take(self) -> None:
-        """Copy tensors of the task. This runs within the captured step, so the host must not read, and addresses must not
-        change.
+        """Copy tensors of the task. This runs within the captured step, so the host must not read tensors, and buffers must
+        keep their addresses.
         """
 
 
@@ -26,12 +26,12 @@ Watcher = TypeVar("Watcher", bound=StepWatcher)
 
 
 class FinalStep:
-    """Observations and state of every environment at the end of the last step, when rewards were computed, before any
-    environment was reset, pushed or given a new command.
+    """Observations and state of every environment in the last step, after rewards were computed and before any environment
+    was reset, pushed or given a new command.
     """
 
     def __init__(self, terms: ObservationTerms, groups: dict[str, ObservationGroup], physics: Physics) -> None:
-        """Allocate copies for the observation groups of a task and its physics."""
+        """Allocate copies of a task's observation groups and of the state of its physics."""
         self._terms, self._groups, self._physics = terms, groups, physics
         self.observations = {name: torch.zeros_like(group.buffer) for name, group in groups.items()}
         """Group -> final observation, (N, history * width)."""
@@ -39,7 +39,7 @@ class FinalStep:
         """(N, nq) and (N, nv) generalised positions and velocities."""
 
     def take(self) -> None:
-        """Copy observations and state in the middle of a step. For this the terms are evaluated once more."""
+        """Copy observations and state. For this the observation terms are evaluated once more."""
         self._terms.evaluate()
         for name, group in self._groups.items():
             group.preview(self.observations[name])

@@ -10,7 +10,7 @@ def gymnasium_model(name: str) -> Path:
     """Return the path of the MJCF file `name` among Gymnasium's MuJoCo environments. Gymnasium itself is not imported.
 
     Raises:
-        ConfigError: this installation of gymnasium has no such file.
+        ConfigError: gymnasium is not installed, or does not have this file.
     """
     found = find_spec("gymnasium")
     folder = Path(found.origin).parent / "envs" / "mujoco" / "assets" if found and found.origin else Path()

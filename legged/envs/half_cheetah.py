@@ -1,6 +1,7 @@
 """HalfCheetah: a planar cheetah with two legs runs as fast as it can. The terms are those of Gymnasium's HalfCheetah-v5.
 
-Wawrzynski, "A cat-like robot real-time learning to run", 2009. The model is Gymnasium's half_cheetah.xml.
+The task goes back to Wawrzynski, "A cat-like robot real-time learning to run", 2009. The model is Gymnasium's
+half_cheetah.xml.
 """
 
 import torch
@@ -46,12 +47,12 @@ class HalfCheetah(BaseTask):
 
     @unit("m, rad")
     def _obs_position(self) -> Tensor:
-        """Generalised positions without x: z, pitch, and six joint angles, of the back leg first [m, rad]."""
+        """Generalised positions without x: z and pitch of the torso, then six joint angles, back leg first [m, rad]."""
         return self.physics.qpos[:, 1:]
 
     @unit("m/s, rad/s")
     def _obs_velocity(self) -> Tensor:
-        """Generalised velocities: x, z, pitch, and six joints [m/s, rad/s]."""
+        """Generalised velocities: x, z and pitch of the torso, then six joints [m/s, rad/s]."""
         return self.physics.qvel
 
     @concurrent

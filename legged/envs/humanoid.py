@@ -77,12 +77,12 @@ class Humanoid(BaseTask):
 
     @unit("m/s, rad/s")
     def _obs_velocity(self) -> Tensor:
-        """Generalised velocities: linear (world) and angular (torso's frame) of the torso, then the joints [m/s, rad/s]."""
+        """Generalised velocities: linear (world axes) and angular (torso's axes) of the torso, then joints [m/s, rad/s]."""
         return self.physics.qvel
 
     @unit("kg, m")
     def _obs_inertia(self) -> Tensor:
-        """MuJoCo's cinert of each body: inertia about the centre of mass, in world axes, offset by mass, and mass [kg, m]."""
+        """MuJoCo's cinert of each body: inertia about the centre of mass in world axes, mass times offset, mass [kg, m]."""
         return self.cinert[:, TORSO:].flatten(1)
 
     @unit("rad/s, m/s")

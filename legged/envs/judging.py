@@ -1,4 +1,4 @@
-"""Rewards, terminations and metrics of a task, and their record."""
+"""Rewards, terminations and metrics of a task: evaluation in each step, and sums for the log."""
 
 from collections.abc import Callable
 from typing import Any
@@ -46,9 +46,9 @@ class JudgingTask:
     _clipped_actions: Tensor
 
     def _collect_judgements(self) -> None:
-        """Collect the terminations, rewards and metrics that the configuration names."""
+        """Collect the terminations and rewards that the configuration names, and all metrics."""
         cfg = self.cfg.rewards
-        # An override without the mark may write tensors that terms read, so then no term runs on a stream.
+        # A hook that is overridden without the mark may write tensors that terms read. Then no term runs on a stream.
         hooks = (self.check_termination, self.measure, self.compute_reward)
         streams = (1, REWARD_STREAMS, 1) if all(is_concurrent(hook) for hook in hooks) else (0, 0, 0)
         self._concurrent_terminations, self._concurrent_rewards, self._concurrent_metrics = (
@@ -84,7 +84,7 @@ class JudgingTask:
 
     @concurrent
     def measure(self) -> None:
-        """Hook: add the step to the metrics. Runs at the same time as the rewards."""
+        """Hook: add the step to the metrics, at the same time as the rewards are computed."""
         self._concurrent_metrics.join()
         self.metrics.add_step(self.valid, self.physics.overflowed, self.terminations.found)
 
@@ -95,12 +95,12 @@ class JudgingTask:
         self.rewards.compute(self.valid)
 
     def _record(self) -> None:
-        """Add the episodes that end to the metrics. Runs at the same time as the curricula."""
+        """Add the episodes that end to the metrics, at the same time as curricula are updated."""
         self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
 
     def _look_for_faults(self) -> None:
-        """Record non-finite states, actions and rewards. Runs at the same time as the hooks from `update_curricula` to
-        `disturb`.
+        """Record non-finite states, actions and rewards, at the same time as the hooks from `update_curricula` to `disturb`
+        run.
         """
         self.nan_guard.check_state(self._in_bounds, self._clipped_actions)
         self.nan_guard.check_rewards(self.rewards.terms_finite, self.valid)

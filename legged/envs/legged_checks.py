@@ -22,7 +22,7 @@ MOST_POINTS = 10_000
 
 
 def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Check the configuration of a legged robot's task of class `cls`, in addition to `check_task`.
+    """Check the settings of a legged robot that `check_task` does not check. `cls` is the task's class.
 
     Raises:
         ConfigError: a setting does not fit the robot or another setting.
@@ -52,11 +52,14 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
         ConfigError: one of them has no mirror image.
     """
     origins = cfg.origins
-    where, otherwise = origins.where("train.algorithm.symmetry"), "false learns without mirror images"
+    where, otherwise = (
+        origins.where("train.algorithm.symmetry"),
+        "train.algorithm.symmetry=false learns without mirror images",
+    )
     if robot.mirror is None:
-        raise ConfigError(f"{where}: '{robot.name}' is lopsided (joints and feet at zero angles); {otherwise}")
+        raise ConfigError(f"{where}: '{robot.name}' is not the same left and right (at zero joint angles); {otherwise}")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
-    if uneven is not None:  # `dof_pos` and actions are relative to that pose
+    if uneven is not None:  # `dof_pos` and actions are relative to the default pose
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
         raise ConfigError(
@@ -105,13 +108,13 @@ def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
         where = cfg.origins.where(f"domain_rand.{table}.{name}.each")
         what = f"numbers for each of the {FIELDS[name].what} have" if each else "one number for all joints has"
         raise ConfigError(
-            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; each: {str(not each).lower()} has one, and"
-            " train.algorithm.symmetry=false learns without"
+            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; set each: {str(not each).lower()}, or"
+            " train.algorithm.symmetry=false to learn without mirror images"
         )
 
 
 def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
-    """Check that passive joints are observed only of a robot that has them.
+    """Check that passive joints are observed only if the robot has passive joints.
 
     Raises:
         ConfigError: the robot has no passive joints.
@@ -148,16 +151,16 @@ def check_points(cfg: LeggedConfig) -> None:
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:
         raise ConfigError(
-            f"{cfg.origins.where('terrain.measured_points_x')}: with measured_points_y they are {points:,} points, more than"
-            f" {MOST_POINTS:,}"
+            f"{cfg.origins.where('terrain.measured_points_x')}: makes {points:,} points with measured_points_y, more"
+            f" than {MOST_POINTS:,}"
         )
 
 
 def check_grid(cfg: LeggedConfig) -> None:
-    """Check that the axes of the command grid of evaluations go from low to high in positive steps.
+    """Check that each axis of evaluation's grid of commands goes from low to high in positive steps.
 
     Raises:
-        ConfigError: an axis does not.
+        ConfigError: the low end of an axis is above the high end, or the step is not positive.
     """
     for axis in ("vx", "vy", "yaw"):
         low, high, step = getattr(cfg.evaluation, axis)

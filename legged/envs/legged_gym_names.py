@@ -1,7 +1,7 @@
-"""Attributes of the environment classes of legged_gym and its forks, for tasks of this package: other names of tensors,
-values computed when they are read, and hints for attributes that do not exist.
+"""Names of attributes in the environment classes of legged_gym and its forks, for tasks of this package: other names of
+tensors, values that are computed when they are read, and hints for names that do not exist here.
 
-These attributes cost nothing until they are read. An attribute that a class sets itself has precedence.
+These attributes cost nothing until they are read. If a class sets an attribute with such a name, its own value is used.
 """
 
 import difflib
@@ -20,8 +20,8 @@ IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordi
 
 
 class ReadOnly(Tensor):
-    """Tensor that is computed when it is read, so that writing into it or into a view of it would have no effect. An attempt
-    to write raises an AttributeError with an alternative. Results computed from it are ordinary tensors.
+    """Tensor of an attribute that is computed when it is read. Writing to this tensor or to a view of it would have no
+    effect, so it raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
     """
 
     instead: str = ""
@@ -76,7 +76,7 @@ def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def _friction(task: Any) -> Tensor:
     drawn = task.randomization.fields
     if "friction" not in drawn:
-        raise AttributeError("friction is not drawn (domain_rand.randomize_friction)")
+        raise AttributeError("friction is not randomised (domain_rand.randomize_friction is off)")
     return drawn["friction"].view(-1, 1, 1)
 
 
@@ -95,7 +95,7 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 def _noise_scale_vec(task: Any) -> Tensor:
     errors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
-    measured = errors.noise if errors is not None and noisy else {}  # this noise is added with the other errors
+    measured = errors.noise if errors is not None and noisy else {}  # `errors` adds the noise of these terms
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 
@@ -138,22 +138,22 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
     "terrain_levels": _of_terrain(lambda task: task.terrain_curriculum.levels),
     "terrain_types": _of_terrain(lambda task: task.terrain_curriculum.columns),
 }
-"""Name -> value that the task has under another name: numbers, texts, and tensors at their own addresses."""
+"""Name in legged_gym -> function that returns the value, which the task has under another name. Tensors are not copied."""
 
 COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
-    "root_states": (_root_states, "a state is put in place in reset_idx(mask), by self.physics.write(mask, qpos, qvel)"),
+    "root_states": (_root_states, "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)"),
     "dof_state": (
         lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2),
-        "a state is put in place in reset_idx(mask), by self.physics.write(mask, qpos, qvel)",
+        "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)",
     ),
-    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "self.base_quat is the physics'"),
+    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "it follows from self.base_quat"),
     "feet_air_time": (
         lambda task: torch.where(task.contacts.first_contact, task.contacts.last_air_time, task.contacts.air_time),
-        "self.contacts counts it, not a reward: (self.contacts.last_air_time - 0.5) * self.contacts.first_contact",
+        "self.contacts counts it; write the reward as (self.contacts.last_air_time - 0.5) * self.contacts.first_contact",
     ),
-    "joint_pos_target": (_joint_pos_target, "self.control makes it of the actions"),
+    "joint_pos_target": (_joint_pos_target, "self.control computes it from the actions"),
 }
-"""Name -> function that computes its value at each reading, and the hint in the error if a user writes into it."""
+"""Name in legged_gym -> function that computes the value at each reading, and a hint for users who try to write to it."""
 
 CONSTANT: dict[str, Callable[[Any], Tensor]] = {
     "gravity_vec": lambda task: torch.tensor([DOWN], device=task.device).repeat(task.num_envs, 1),
@@ -166,7 +166,7 @@ CONSTANT: dict[str, Callable[[Any], Tensor]] = {
     "height_points": lambda task: torch.nn.functional.pad(task.height_scan.points, (0, 1)).repeat(task.num_envs, 1, 1),
     "terrain_origins": _of_terrain(lambda task: torch.tensor(task.terrain.origins, dtype=torch.float32, device=task.device)),
 }
-"""Name -> constant that is made at the first reading."""
+"""Name in legged_gym -> function that makes a constant at the first reading."""
 
 KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_root_vel": lambda task: _root_states(task)[:, 7:],
@@ -175,7 +175,7 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_dof_pos": lambda task: task.dof_pos,
     "last_last_actions": lambda task: task.last_actions,
 }
-"""Name -> value of the last step, which is stored in every step from the first reading on."""
+"""Name in legged_gym -> function whose value each step stores for the next one, if a term reads the name."""
 
 _COUNT = "count in your own tensor: allocate it in _init_buffers() and add to it in place in advance()"
 _GYM = "there is no Isaac Gym: self.physics makes the steps, and a class overrides the hooks of _step()"
@@ -191,7 +191,6 @@ _PICTURES = "nothing is drawn while training; play.py makes pictures (legged/ren
 
 
 def _drawn(name: str) -> str:
-    """Return the hint at a randomised property."""
     return f"self.randomization.fields['{name}'] has the values that domain_rand.ranges.{name} draws (docs/randomisation.md)"
 
 
@@ -239,7 +238,7 @@ ABSENT = {
     "debug_viz": _PICTURES,
     "init_done": "_init_buffers() runs before the first step; all other hooks run after it",
 }
-"""Missing name -> hint at its replacement."""
+"""Name in legged_gym or its forks that does not exist here -> hint at its replacement."""
 NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
 
 
@@ -247,10 +246,10 @@ class LeggedGymNames:
     """Mixin of LeggedRobot with legged_gym's names. N robots, D joints, F feet, P heights.
 
     `root_states` (N, 13) has position [m], orientation (x, y, z, w), linear [m/s] and angular velocity [rad/s], all in the
-    world frame, as in Isaac Gym; `base_quat` has w first, and `base_lin_vel` and `base_ang_vel` are in the base frame.
+    world frame, as in Isaac Gym. (In `base_quat` w is first; `base_lin_vel` and `base_ang_vel` are in the base frame.)
     `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
     continue or end at this step [s]. `rpy` (N, 3) has roll, pitch and yaw [rad]. `friction_coeffs` is (N, 1, 1),
-    `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3); `noise_scale_vec` has a number for
+    `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3). `noise_scale_vec` has a number for
     each of the actor's columns. All other names have the shapes and units of their counterparts in this package.
     """
 
@@ -259,7 +258,7 @@ class LeggedGymNames:
     if not TYPE_CHECKING:  # so that a type checker still reports missing attributes
 
         def __getattr__(self, name: str) -> Any:
-            if hasattr(type(self), name):  # this property failed; reading it again raises its error
+            if hasattr(type(self), name):  # a property failed; reading it again raises the original error
                 return object.__getattribute__(self, name)
             if name in NAMES:
                 try:
@@ -272,10 +271,10 @@ class LeggedGymNames:
             raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{hint}")
 
     def _by_their_name(self, name: str) -> Any:
-        """Return the value of one of legged_gym's names.
+        """Return the value of legged_gym's attribute `name`.
 
         Raises:
-            AttributeError: this task lacks it; the text suggests a replacement.
+            AttributeError: this task does not have the attribute; the message suggests a replacement.
         """
         if name in PLAIN:
             return PLAIN[name](self)
@@ -300,9 +299,9 @@ class LeggedGymNames:
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
     def remember(self) -> None:
-        """Store the values of `KEPT` that were read, before the task overwrites its own stored values."""
+        """Store those values of `KEPT` that a term has read, before the task overwrites the values that it stores itself."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
-            if name == "last_last_actions":  # for ended episodes `last_actions` is out of date
+            if name == "last_last_actions":  # a new episode must not see actions of the old one
                 masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]

@@ -31,13 +31,13 @@ from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
 POSES = 256
-"""Number of poses that are drawn at the start for a robot with closed loops."""
+"""Number of random initial poses that are computed at the start for a robot with closed loops."""
 
 
 class LeggedRobot(Terms, LeggedGymNames, BaseTask):
-    """Legged robots that follow velocity commands. Subclass it and add methods `_reward_<name>`, `_obs_<name>`,
-    `_terminate_<name>` or `_metric_<name>`; the configuration names the ones that run. N robots, D joints, F feet, B tracked
-    collision shapes.
+    """Legged robots that follow velocity commands. Subclass this class and add methods `_reward_<name>`, `_obs_<name>` or
+    `_terminate_<name>`, which run if the configuration names them, or `_metric_<name>`, which always run. N robots, D joints,
+    F feet, B tracked collision shapes.
     """
 
     Config: ClassVar[type[TaskConfig]] = LeggedConfig
@@ -46,11 +46,11 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def __init__(
         self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
-        """Build physics and MDP on `device`; with `graph`, the step is captured on a GPU. If `terrain` is given, it replaces
-        the configured one.
+        """Build physics and MDP on `device`. With `graph`, the step is captured in a CUDA graph if `device` is a GPU. If
+        `terrain` is given, it replaces the configured one.
 
         Raises:
-            ConfigError: the configuration names something that does not exist. Nothing has been compiled yet.
+            ConfigError: the configuration or the task class is invalid.
             TermError: a term fails or cannot be captured.
         """
         self.terrain = terrain
@@ -63,7 +63,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         Raises:
             ConfigError: the configuration is invalid for this task.
         """
-        check_overrides(cls)  # first: a wrong override can make the other checks fail
+        check_overrides(cls)  # comes first, because a wrong override can make other checks fail
         assert isinstance(cfg, LeggedConfig)
         robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
@@ -84,7 +84,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return RobotScene(self.robot, self.terrain)
 
     def make_terrain(self) -> Terrain | None:
-        """Hook: return the ground of the configuration; None for a plane. A subclass may return another one."""
+        """Hook: return the configured terrain; None for a plane. A subclass may return another terrain."""
         cfg = self.cfg.terrain
         return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
 
@@ -145,7 +145,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
         low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
         self._reset_joints = self.numbers.between(low, high, robot.num_dof)
-        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, angular; base frame
+        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, then angular; base frame
         self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
         self._poses: Tensor | None = None
@@ -170,8 +170,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return torch.where(torch.isfinite(bounded), bounded, limits)
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
-        """Return the terminations that are evaluated. A limit of 0 switches its termination off. On a plane `left_terrain` is
-        off.
+        """Return the names of the failures and of the time-outs that are evaluated. A limit of 0 switches `base_height` or
+        `tilt` off, and on a plane `left_terrain` is off.
         """
         cfg = self.cfg.terminations
         limits = (("base_height", cfg.min_base_height), ("tilt", cfg.max_tilt))
@@ -185,7 +185,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return [name for name in failures if name not in off], [name for name in time_outs if name not in off]
 
     def observation_scales(self) -> dict[str, Any]:
-        """Return the factor on each term. By default, commands have the factors of the velocities that they command."""
+        """Return the factor on each observation. By default, commands have the factors of base_lin_vel and base_ang_vel."""
         scales = super().observation_scales()
         lin, ang = scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
         scales.setdefault("commands", [lin, lin, ang])
@@ -209,7 +209,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     # ---- hooks of a control step -------------------------------------------------------------------------------------
 
     def set_controls(self) -> None:
-        """Set the actions of the control law."""
+        """Pass the actions to the control law."""
         self.control.set_actions(self.actions)
 
     def apply_control(self) -> None:
@@ -221,8 +221,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.disturbances.draw()
 
     def draw_reset(self) -> None:
-        """Draw initial states: joints near the default pose, and a moving base at its spawn height. A robot with passive
-        joints gets one of the poses that were drawn at the start, because its loops must be closed.
+        """Draw joint angles near the default pose, and velocity and yaw of the base. A robot with passive joints gets one of
+        the poses that were computed at the start, because only in these its loops are closed.
         """
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.draw()
@@ -272,14 +272,14 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._vary_velocity_limits(again=True)
 
     def _vary_control(self, again: bool = False) -> None:
-        """Apply randomised properties to the control law. With `again`, apply only those that change within steps."""
+        """Apply randomised properties to the control law; with `again`, only those with `when: reset` or `interval`."""
         names = self.randomization.redrawn if again else self.randomization.draws
         drawn = self.randomization.fields
         self.control.vary({name: drawn[name] for name in names})
 
     def _vary_velocity_limits(self, again: bool = False) -> None:
-        """Apply the randomised `velocity_limit` to `dof_vel_limits` and to the no-load speeds of motors. With `again`, apply
-        it only if it changes within steps.
+        """Apply the randomised `velocity_limit` to `dof_vel_limits` and to the no-load speeds of motors; with `again`, only
+        if it has `when: reset` or `interval`.
         """
         if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
             factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
@@ -296,7 +296,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return bool(self.cfg.domain_rand.forces)
 
     def disturb(self, mask: Tensor) -> None:
-        """Apply pushes, kicks and forces to the robots of `mask` (N,) that are due."""
+        """Apply the pushes, kicks and forces that are due, but only to robots in `mask` (N,)."""
         self.pushes.push(self.physics, mask)
         self.disturbances.act(self.physics, mask)
 
@@ -311,7 +311,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
         """Set fixed commands vx, vy [m/s] and yaw rate [rad/s], (N, 3) or (3,), until the next call; return the observations.
-        With `heading` (N,) [rad] and in heading mode, the yaw rate steers towards it instead.
+        If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead.
         """
         self.command_sampler.hold(commands, heading)
         self.observation_terms.evaluate(self.episode_length_buf == 0, again=True)

@@ -1,6 +1,6 @@
-"""Marks on the methods of a task. One gives the unit of a term; the other lets a term run before terminations are determined.
+"""Marks on methods of a task. `@unit` gives a term's unit; `@concurrent` lets a term run while terminations are determined.
 
-A mark belongs to one method. A method that overrides it in another class has only the marks that are written above itself.
+A subclass that overrides a method does not inherit its marks. They have to be written above the override too.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def unit(text: str) -> Callable[[Method], Method]:
-    """Declare the unit of a term's values, such as "m^2/s^2"; "1" for a plain number. Units of several columns are separated
-    by commas. The first unit counts when settings are rescaled for another robot (docs/scaling.md).
+    """Declare the unit of a term's values, such as "m^2/s^2"; "1" for a plain number. If columns have different units, list
+    them, separated by commas. The first unit counts when settings are rescaled for another robot (docs/scaling.md).
 
     Raises:
         ConfigError: the text is not a unit.

@@ -1,4 +1,4 @@
-"""Observation groups of a task, and the errors of the groups with noise."""
+"""Observation groups of a task, and errors of the observations in groups with noise."""
 
 from typing import Any
 
@@ -22,12 +22,12 @@ class ObservingTask:
         return dict(self.cfg.observations.scales)
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return the height map with errors that the term `heights` reads; None if the map has no errors."""
+        """Return the inexact height map from which the term `heights` is read; None if the map has no errors."""
         return None
 
     def make_observation_errors(self) -> ObservationErrors | None:
-        """Return the errors of terms with bias, delay, loss or a map with errors. Return None if no group with noise has such
-        a term.
+        """Return the object that adds bias, delay, loss and errors of the height map to terms. Return None if no group with
+        noise has a term with such errors.
         """
         cfg, noise = self.cfg.observations, self._noise()
         noisy = {term for group in cfg.groups.values() if group.noise for term in group.terms} if cfg.add_noise else set()

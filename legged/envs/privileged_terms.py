@@ -21,9 +21,9 @@ PREFIX = "rand_"
 class PrivilegedTerms:
     """Mixin of BaseTask with the terms `_obs_rand_<field>`, one for each field of `physics.FIELDS`, and `_obs_push_force`.
 
-    A field's term is (N, 1), or (N, rows) if every row has its own number. Its values -1 and 1 are the ends of the configured
-    range, even while the range is still widening. With `log_uniform` the scale is logarithmic. A field that only
-    `domain_rand.observed_ranges` names always has its neutral value.
+    A field's term is (N, 1), or (N, rows) if every joint, body or shape has its own number. The ends of the configured range
+    are observed as -1 and 1, even while the range is still widening. With `log_uniform` the scale is logarithmic. A field in
+    `domain_rand.observed_ranges` that `domain_rand.ranges` does not draw is observed at its neutral value.
     """
 
     cfg: Any
@@ -35,8 +35,8 @@ class PrivilegedTerms:
 
     @unit("1")
     def _obs_push_force(self) -> Tensor:
-        """Forces that act on bodies from outside (domain_rand.forces), x, y and z of each in the world frame, as a share of
-        the largest that is drawn [1].
+        """External forces on bodies (domain_rand.forces): x, y and z of each force in the world frame, as shares of the
+        largest component that can be drawn [1].
         """
         found = []
         for name, cfg in observed_forces(self.cfg).items():
@@ -47,7 +47,6 @@ class PrivilegedTerms:
 
 
 def _mirror_kind(name: str, field: Field) -> MirrorKind:
-    """Return the kind of a field's mirror image."""
     if name == "joint_offset":
         return "joints"
     if name.endswith("_y"):
@@ -71,8 +70,8 @@ def largest_of(force: ForceConfig) -> float:
 
 
 def observed(cfg: Any, name: str) -> DrawConfig | None:
-    """Return the draw whose range normalises a field in observations. Return None if the configuration has no range for the
-    field.
+    """Return the distribution whose range scales the observation of a field to [-1, 1]. Return None if the configuration has
+    no range for the field.
     """
     rand = cfg.domain_rand
     entry = rand.observed_ranges.get(name, rand.ranges.get(name))
@@ -84,7 +83,7 @@ def observed(cfg: Any, name: str) -> DrawConfig | None:
 
 
 def normalised(values: Tensor, draw: DrawConfig) -> Tensor:
-    """Return values scaled to -1 and 1 at the ends of a draw's range; 0 for a range without width."""
+    """Return `values` on a scale on which the ends of the range of `draw` are -1 and 1; 0 if the ends are equal."""
     low, high = draw.range
     if draw.distribution == "log_uniform":
         values, low, high = values.clamp(min=1e-9).log(), math.log(low), math.log(high)
@@ -95,7 +94,7 @@ def _observer(name: str, field: Field) -> Callable[[Any], Tensor]:
     def observe(self: Any) -> Tensor:
         draw = observed(self.cfg, name)
         if draw is None:
-            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not draw it, so there is nothing to observe")
+            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not draw '{name}', so it can't be observed")
         drawn = self.randomization.fields.get(name)
         if drawn is None:
             each = field.each if draw.each is None else draw.each

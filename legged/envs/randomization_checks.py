@@ -16,7 +16,7 @@ def check_randomization(cfg: TaskConfig) -> None:
     """Check the ranges of randomised properties, before anything is built.
 
     Raises:
-        ConfigError: a property or its draw is invalid, or does not fit the engine or the control law.
+        ConfigError: a property does not exist, its entry is invalid, or it does not fit the engine or the control law.
     """
     rand, legged = cfg.domain_rand, isinstance(cfg, LeggedConfig)
     for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
@@ -27,9 +27,7 @@ def check_randomization(cfg: TaskConfig) -> None:
         for name, entry in rand.ranges.items():
             if draw_of(entry).when != "start":
                 where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
-                raise ConfigError(
-                    f"{where}: newton's {cfg.sim.solver} draws at the start only; sim.solver=mujoco also draws later"
-                )
+                raise ConfigError(f"{where}: {cfg.sim.solver} can't change properties after the start; sim.solver=mujoco can")
     if isinstance(cfg, LeggedConfig) and cfg.control.laws == {"T"}:
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:
@@ -47,14 +45,14 @@ def check_randomization(cfg: TaskConfig) -> None:
                 )
     if isinstance(cfg, LeggedConfig) and "P" not in cfg.control.laws and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
-        raise ConfigError(f"{where}: control.control_type V does not look at joint angles, so an offset has no effect")
+        raise ConfigError(f"{where}: control.control_type V does not read joint angles, so an offset has no effect")
 
 
 def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Callable[[str], str]) -> None:
-    """Check the draw of one property; `legged` is True for tasks of legged robots.
+    """Check the entry of one property; `legged` is True for tasks of legged robots.
 
     Raises:
-        ConfigError: the property does not exist in this task, or its draw is invalid.
+        ConfigError: the property does not exist in this task, or its entry is invalid.
     """
     if name not in FIELDS:
         known = suggest(name, FIELDS, "properties")
@@ -62,13 +60,13 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
     field, (low, high) = FIELDS[name], draw.range
     unit = "" if field.unit == "1" else f" [{field.unit}]"
     if not field.changes and not legged:
-        raise ConfigError(f"{where(path)}: only the control law of legged robots has it ({field.meaning})")
+        raise ConfigError(f"{where(path)}: only tasks of legged robots have this property ({field.meaning})")
     for bound, wrong, word in ((field.lowest, low, "least"), (field.highest, high, "most")):
         if bound is not None and (wrong < bound if word == "least" else wrong > bound):
             raise ConfigError(f"{where(path)}: must be at {word} {bound:g}{unit} ({field.meaning}), got {wrong:g}")
     if draw.distribution == "log_uniform" and low <= 0.0:
         given = where(f"{path}.distribution")
-        raise ConfigError(f"{given}: log_uniform draws from ranges above 0, not from [{low:g}, {high:g}]; uniform from any")
+        raise ConfigError(f"{given}: log_uniform draws from ranges above 0 only, got [{low:g}, {high:g}]")
     if draw.std and draw.distribution != "gaussian":
         raise ConfigError(f"{where(f'{path}.std')}: only gaussian has a standard deviation, {draw.distribution} has none")
     if draw.when == "interval" and not draw.interval_s:
@@ -78,11 +76,11 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
         raise ConfigError(f"{where(f'{path}.interval_s')}: {told}")
     _check_grow(draw, path, where)
     if draw.grow[1] and draw.when == "start":
-        raise ConfigError(f"{where(f'{path}.grow')}: a property drawn at the start can't grow; `when: reset` draws at resets")
+        raise ConfigError(f"{where(f'{path}.grow')}: the range can't widen if the property is drawn only at the start")
     if draw.grow[1] and field.derived:
         raise ConfigError(
-            f"{where(f'{path}.grow')}: can't grow: MuJoCo derives constants from it, so the models that robots choose from"
-            " are drawn at the start"
+            f"{where(f'{path}.grow')}: the range can't widen: MuJoCo derives constants from the property, so all values that"
+            " robots choose from are drawn at the start"
         )
 
 
@@ -90,10 +88,10 @@ def _check_grow(of: DrawConfig | KickConfig | ForceConfig, path: str, where: Cal
     """Check the iterations between which a range widens.
 
     Raises:
-        ConfigError: the first equals the last, and both are not 0.
+        ConfigError: the first and the last iteration are equal, and not 0.
     """
     if of.grow != (0.0, 0.0) and of.grow[0] == of.grow[1]:
-        told = "expected [first, last] with first < last, or [0, 0] for no growth"
+        told = "expected [first, last] with first < last, or [0, 0] for a constant range"
         raise ConfigError(f"{where(f'{path}.grow')}: {told}, got {list(of.grow)}")
 
 
@@ -118,7 +116,7 @@ def _check_derived(cfg: TaskConfig) -> None:
             names = ", ".join(moments)
             text = f"MuJoCo derives constants from {names} together, so they must have the same `when` and interval_s"
             if "added_base_mass" in moments and "added_base_mass" not in cfg.domain_rand.ranges:
-                text += " (randomize_base_mass draws at the start; an entry added_base_mass of ranges replaces it)"
+                text += " (randomize_base_mass draws at the start; add added_base_mass to domain_rand.ranges instead)"
             raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
 
 
@@ -164,10 +162,10 @@ def check_observed(cfg: TaskConfig) -> None:
             draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
             if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
                 low, high = draw.range
-                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # mirrored, a value would leave [-1, 1]
+                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # the mirror image could leave [-1, 1]
                     raise ConfigError(
                         f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not the same on both sides of"
-                        " 0, so it has no mirror image; train.algorithm.symmetry=false learns without"
+                        " 0, so it has no mirror image; train.algorithm.symmetry=false needs none"
                     )
             if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
                 raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
@@ -176,5 +174,5 @@ def check_observed(cfg: TaskConfig) -> None:
                 if aside:
                     raise ConfigError(
                         f"{cfg.origins.where(path)}: push_force: a force on '{aside[0]}' has no mirror image, only forces on"
-                        " the base have one; train.algorithm.symmetry=false learns without"
+                        " the base have one; train.algorithm.symmetry=false needs none"
                     )

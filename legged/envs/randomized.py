@@ -1,4 +1,4 @@
-"""Physics of a task with randomised properties, and their changes within steps."""
+"""Physics of a task with randomised properties, and changes of these properties within steps."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -41,7 +41,7 @@ class RandomizedTask:
 
         Raises:
             ConfigError: the engine or the model lacks a randomised property, or `each` is set for a property of which a robot
-                has only one.
+                has only one value.
         """
         cfg, where = self.cfg, self.cfg.origins.where
         fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
@@ -53,7 +53,7 @@ class RandomizedTask:
         for name, draw in self.randomization.draws.items():
             if draw.each and self.field_rows[name] < 2:
                 path = where(f"domain_rand.ranges.{name}.each")
-                raise ConfigError(f"{path}: each robot has only one number of this property; leave each out")
+                raise ConfigError(f"{path}: a robot has only one value of this property; remove the setting each")
         self.randomization.widen(self.field_rows)
         self.randomization.apply(self.physics)
 
@@ -63,7 +63,7 @@ class RandomizedTask:
 
     @contextmanager
     def redrawing(self, mask: Tensor) -> Iterator[None]:
-        """Run `redraw` on a parallel stream of the block. Episodes begin in the environments of `mask` (N,)."""
+        """Run `redraw` on another stream, in parallel with the block. `mask` (N,) is True where an episode begins."""
         if not self.randomization.redrawn:
             yield
             return
@@ -74,9 +74,8 @@ class RandomizedTask:
         self._stream_2.join()
 
     def redraw(self, mask: Tensor) -> None:
-        """Hook: apply new values of randomised properties to the environments of `mask` (N,), whose episodes begin, and to
-        those whose interval has elapsed. The hook is called only if a property changes within steps, and runs at the same
-        time as `forget`.
+        """Hook: give new values to randomised properties, at resets (where `mask` (N,) is True) and when an interval has
+        elapsed. The hook is called only if a property has `when: reset` or `interval`. It runs at the same time as `forget`.
         """
         self.randomization.redraw(mask)
         with self._stream_2.fork():

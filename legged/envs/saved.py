@@ -23,7 +23,7 @@ class SavedTask(RandomizedTask):
     observation_terms: ObservationTerms
 
     def progress(self) -> dict[str, Any]:
-        """Return the progress of curricula, which every checkpoint holds. It fits any number of environments."""
+        """Return the progress of curricula, which every checkpoint holds. Any number of environments can load it."""
         grown = self.randomization.progress()
         return {"randomization": grown} if grown else {}
 
@@ -32,7 +32,7 @@ class SavedTask(RandomizedTask):
         self.randomization.load_progress(progress.get("randomization", {}))
 
     def parts(self) -> dict[str, Any]:
-        """Return the parts that have a `STATE`, by their names in saved states. A subclass adds its own parts."""
+        """Return the parts with tensors to save (`STATE`), by their names in saved states. A subclass adds its own parts."""
         return {
             "faults": self.nan_guard,
             "randomization": self.randomization,
@@ -42,8 +42,8 @@ class SavedTask(RandomizedTask):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return copies of all tensors that determine the next step, together with the actions and the state of torch's
-        random generator.
+        """Return copies of the simulation's tensors. The next step follows from these, the actions and the state of torch's
+        random generator, which is not included.
         """
         return {
             "physics": {name: tensor.clone() for name, tensor in self.physics.state_tensors().items()},
@@ -53,7 +53,7 @@ class SavedTask(RandomizedTask):
 
     @torch.no_grad()
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load a saved state. The next step then equals the step that followed when the state was saved.
+        """Load a saved state. With the same actions and random numbers, the next steps equal those after the save.
 
         Raises:
             StateError: the state belongs to another task or another number of environments. The task may be partly
@@ -68,8 +68,8 @@ class SavedTask(RandomizedTask):
         self.physics.load_state(state.get("physics", {}))
 
     def _own_tensors(self) -> dict[str, Tensor]:
-        """Return the attributes of the task, and of its subclasses, that are tensors with a row per environment. Tensors that
-        belong to a part or to the physics are left out.
+        """Return, by name, the attributes of the task that are tensors with N rows. Tensors that belong to a part or to the
+        physics are left out.
         """
         owners = [self.physics, self.physics.robot_state, *self.parts().values()]
         others = [*self.physics.state_tensors().values()]

@@ -19,11 +19,11 @@ from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
-"""Contact force on a terminating shape that ends the episode, as a multiple of the contact threshold of the feet (1 N, or 1 %
-of the weight of a light robot).
+"""Contact force on a terminating shape above which the episode ends, as a multiple of the contact threshold of the feet (1 N,
+or 1 % of the weight of a robot that weighs less than 100 N).
 """
 PENALISED_FORCE = 0.1
-"""Contact force on a penalised shape that counts as a collision, as a multiple of the same threshold."""
+"""Contact force on a penalised shape above which the contact is a collision, as a multiple of the same threshold."""
 
 
 class Terms:
@@ -90,17 +90,17 @@ class Terms:
     feet_vel: Tensor
     contact_forces: Tensor
     """(N, B, 3) contact forces on the tracked shapes in the world frame [N]. `feet_indices`, `penalised_indices` and
-    `termination_indices` select shapes."""
+    `termination_indices` are indices of these shapes."""
     feet_indices: Tensor
     _feet_shapes: slice | Tensor
-    """Feet among the shapes. Evenly spaced indices become a slice, because a slice costs no launch. The same holds for
-    `_terminating_shapes`."""
+    """Indices of the feet among the tracked shapes; evenly spaced ones as a slice, because indexing by a slice costs no
+    launch. `_terminating_shapes` are those whose contact ends an episode."""
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
     """(D,) 1 for joints that neither swing a leg forward and back nor turn a wheel, 0 for the others."""
     _without_wheels: Tensor | None
-    """Indices of the joints that are no wheels; None if the robot has no wheels."""
+    """Indices of the joints that are not wheels; None if the robot has no wheels."""
     contacts: FeetContacts
     """Contact and swing times of the feet."""
     control: Control
@@ -149,7 +149,7 @@ class Terms:
 
     @unit("rad")
     def _obs_passive_pos(self) -> Tensor:
-        """Angles of the passive joints, less those of the default pose; of a spring, its deflection [rad]."""
+        """Angles of the passive joints minus those of the default pose; for a spring this is the deflection [rad]."""
         return self.physics.qpos[:, self.passive_qpos_columns] - self.passive_default_pos
 
     @unit("rad/s")
@@ -164,8 +164,8 @@ class Terms:
 
     @unit("m")
     def _obs_heights(self) -> Tensor:
-        """Base above ground, less an offset: clip(base_z - offset - ground_z, -limit, deepest) at each of the points, which
-        lie in the yaw frame; base_z and ground_z in the world frame [m].
+        """Height of the base above the ground at each point, less an offset: clip(base_z - offset - ground_z, -limit,
+        deepest). Points are in the yaw frame, base_z and ground_z in the world frame [m].
         """
         return self.heights_seen(self.measured_heights)
 
@@ -175,14 +175,14 @@ class Terms:
         return (self.base_pos[:, 2:3] - seen.heights_offset - ground).clamp(-seen.heights_limit, seen.deepest)
 
     def without_wheels(self, values: Tensor) -> Tensor:
-        """Return those of the values by joint (N, D) that belong to no wheel."""
+        """Return `values` (N, D), one for each joint, without the columns of wheels."""
         return values if self._without_wheels is None else values.index_select(1, self._without_wheels)
 
     def _force(self, units: float) -> float:
-        """Return a force [N] given as a multiple of the contact threshold of this robot's feet."""
+        """Return `units` times the contact threshold of this robot's feet [N]."""
         return units * self.contacts.force
 
-    # ---- rewards: (N,) each, times scale and control step ------------------------------------------------------------
+    # ---- rewards: (N,) each, before the multiplication by scale and control step ---------------------------------------
 
     @concurrent
     @unit("1")
@@ -213,13 +213,13 @@ class Terms:
     @concurrent
     @unit("1")
     def _reward_orientation(self) -> Tensor:
-        """Leaning: squared horizontal part of gravity in the base frame."""
+        """Leaning: sum of the squares of x and y of `projected_gravity`."""
         return self.projected_gravity[:, :2].square().sum(dim=1)
 
     @concurrent
     @unit("m^2")
     def _reward_base_height(self) -> Tensor:
-        """Squared distance of the base's height, above the mean of the scanned ground, from base_height_target [m^2]."""
+        """Squared difference between the base's height above the mean of the scanned ground and base_height_target [m^2]."""
         height = self.base_pos[:, 2] - self.measured_heights.mean(dim=1)
         return (height - self.cfg.rewards.base_height_target).square()
 
@@ -263,7 +263,7 @@ class Terms:
     @concurrent
     @unit("rad")
     def _reward_dof_pos_limits(self) -> Tensor:
-        """Angles of joints, without wheels, beyond their soft limits [rad]."""
+        """Sum of the angles by which joints, without wheels, exceed their soft limits [rad]."""
         low, high = self.dof_pos_limits[:, 0], self.dof_pos_limits[:, 1]
         beyond = (low - self.dof_pos).clamp(min=0.0) + (self.dof_pos - high).clamp(min=0.0)
         return self.without_wheels(beyond).sum(dim=1)
@@ -271,14 +271,14 @@ class Terms:
     @concurrent
     @unit("rad/s")
     def _reward_dof_vel_limits(self) -> Tensor:
-        """Joint speeds beyond their soft limits, at most 1 rad/s for each joint [rad/s]."""
+        """Sum of the speeds by which joints exceed their soft limits, at most 1 rad/s for each joint [rad/s]."""
         limit = self.dof_vel_limits * self.cfg.rewards.soft_dof_vel_limit
         return (self.dof_vel.abs() - limit).clamp(0.0, 1.0).sum(dim=1)
 
     @concurrent
     @unit("N m")
     def _reward_torque_limits(self) -> Tensor:
-        """Torques beyond their soft limits [N m]."""
+        """Sum of the torques by which joints exceed their soft limits [N m]."""
         limit = self.control.torque_limits * self.cfg.rewards.soft_torque_limit
         return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
 
@@ -309,15 +309,15 @@ class Terms:
     @concurrent
     @unit("N")
     def _reward_feet_contact_forces(self) -> Tensor:
-        """Contact forces on feet beyond max_contact_force [N]."""
+        """Sum of the forces by which contacts of feet exceed max_contact_force [N]."""
         force = self.contact_forces[:, self.feet_indices].norm(dim=2)
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
 
     @concurrent
     @unit("s")
     def _reward_single_stance(self) -> Tensor:
-        """Steps of a biped: half of air_time_target_s plus the other foot's air time, while exactly one foot stands and any
-        motion is commanded [s].
+        """Steps of a biped: half of air_time_target_s plus the air time of the swinging foot, while exactly one foot stands
+        and any motion is commanded [s].
 
         Beyond the target, a longer air time earns less, and from twice the target on the reward is 0. If every long swing
         were rewarded, robots would take one step a second and could not turn in between. If the fixed half were missing,
@@ -387,7 +387,7 @@ class Terms:
 
     @concurrent
     def _terminate_left_terrain(self) -> Tensor:
-        """Base beyond the middle of the level border around all tiles, where walking cannot be judged."""
+        """Base beyond the middle of the level border around all tiles. Walking cannot be judged there."""
         assert self.terrain is not None
         x, y = self.terrain.reach
         return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)

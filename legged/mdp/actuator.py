@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 LARGEST_GAIN = 2.0
-"""Largest gain of a torque-speed line: the change of a joint's speed within a physics step, divided by the distance of its
-speed from the line. With a larger gain the speed diverges."""
+"""Largest stable gain of a torque-speed line. At full torque, the motor changes a joint's speed in a physics step by the gain
+times the difference between no-load speed and joint speed. With a larger gain the speed diverges."""
 
 
 def is_ideal(cfg: ActuatorConfig) -> bool:
@@ -50,8 +50,8 @@ class MotorCurve:
         self.nominal_speed = no_load_speed
 
     def vary(self, factor: Tensor) -> None:
-        """Set no-load speeds to their nominal values times `factor`, (N, 1) or (N, D). The first call allocates; later calls
-        write in place.
+        """Set no-load speeds to their nominal values times `factor`, (N, 1) or (N, D). The first call allocates a tensor, and
+        later calls write in place.
         """
         if self.no_load_speed is self.nominal_speed:
             self.no_load_speed = factor * self.nominal_speed
@@ -91,8 +91,8 @@ class Actuator:
     """Actuators of N robots with D joints: delay, motor and friction between targets and joint torques.
 
     A target is set once per control step. The target reaches the control law after the robot's delay, in physics steps. Until
-    the first target arrives, joints have the target of action 0. The law's torque is limited to the motor's, then friction is
-    subtracted.
+    the first target arrives, joints have the target of action 0. The torque of the law is limited to what the motor can give,
+    then friction is subtracted.
     """
 
     STATE: tuple[str, ...] = ("targets", "delay")
@@ -107,8 +107,8 @@ class Actuator:
         numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Build actuators of `shape` (N, D). `middle`, (D,) or (), is the joint target when all actions are zero, on the
-        device of the actuators. Delays are drawn from the pool `numbers`.
+        """Build actuators of `shape` (N, D) on the device of `middle`. `middle`, (D,) or (), is the joint target when all
+        actions are zero. Delays are drawn from the pool `numbers`.
 
         Raises:
             ConfigError: as for `check_actuator`.
@@ -150,7 +150,7 @@ class Actuator:
             self.STATE = (*self.STATE, "past")
 
     def describe(self, joint: int) -> str:
-        """Return the deviations of a joint's motor from an ideal motor, in a few words."""
+        """Describe in a few words how a joint's motor differs from an ideal motor."""
         curve, friction, parts = self.curve, self.friction, []
         if self.network is not None and bool(self._by_network[joint]):
             parts.append(f"torque by a network ({self.network.kind})")
@@ -166,7 +166,7 @@ class Actuator:
 
     @property
     def past(self) -> Tensor:
-        """Hidden state of the network."""
+        """State of the network, under its name in saved states."""
         assert self.network is not None
         return self.network.state
 
@@ -177,7 +177,7 @@ class Actuator:
         self._steps = 0
 
     def delayed(self) -> Tensor:
-        """Return the targets (N, D) that are in force at this physics step."""
+        """Return the targets (N, D) that have reached the control law at this physics step."""
         if not self.longest:
             return self.newest
         late = (self.delay - self._steps).clamp_(min=0) + (self.decimation - 1)
@@ -217,7 +217,7 @@ class Actuator:
         self._steps += 1
 
     def _limit(self, asked: Tensor, dof_vel: Tensor, effort: Tensor, out: Tensor) -> None:
-        """Write to `out` (N, D) the commanded torques `asked` (N, D), limited by the motors, less friction [N m]."""
+        """Limit the torques `asked` (N, D) to those of the motors, subtract friction, and write to `out` (N, D) [N m]."""
         if self._has_curve:
             low, high = self.curve.limits(dof_vel, effort)
             asked = torch.minimum(torch.maximum(asked, low), high)
@@ -228,12 +228,12 @@ class Actuator:
         torch.clamp(asked, -effort, effort, out=out)
 
     def reset(self, mask: Tensor, middle: Tensor) -> None:
-        """Reset the robots in `mask` (N,), and draw their delay. `middle`, (D,), (N, D) or (), is the joint target when all
-        actions are zero. With delay_varies, draw the delay of all robots.
+        """Reset the robots in `mask` (N,) and draw new delays for them; with delay_varies, draw new delays for all robots.
+        `middle`, (D,), (N, D) or (), is the joint target when all actions are zero.
         """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
-            if self._varies:  # a target that has arrived stays in force
+            if self._varies:  # a longer new delay must not take back a target that has arrived
                 latest = (torch.div(self.delay, self.decimation, rounding_mode="floor") + 1) * self.decimation
                 torch.where(mask, drawn, torch.minimum(drawn, latest), out=self.delay)
             else:
@@ -245,8 +245,8 @@ class Actuator:
 
 
 def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the indices of the joints to which the motor model, and the network if there is one, applies. `where` turns a
-    dotted path into the beginning of an error message.
+    """Return the indices of the joints that have the motor model, and the network if one is given (control.actuator.joints).
+    `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -257,8 +257,8 @@ def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], st
 
 
 def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
-    """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,) each. The speed of ideal motors is infinite.
-    `where` turns a dotted path into the beginning of an error message.
+    """Return stall torque [N m] and no-load speed [rad/s] of all joints, (D,) each. Ideal motors have an infinite no-load
+    speed. `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint, or a motor has neither a no-load speed nor a velocity limit.
@@ -268,13 +268,13 @@ def motor_numbers(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str]
     driven = np.isin(np.arange(robot.num_dof), modelled_joints(robot, cfg, where)) & (cfg.model == "dc_motor")
     if not np.all(np.isfinite(speed[driven]) & (speed[driven] > 0.0)):
         name = robot.joint_names[int(np.flatnonzero(driven & ~(np.isfinite(speed) & (speed > 0.0)))[0])]
-        raise ConfigError(f"{where('control.actuator.no_load_speed')}: '{name}' has no velocity limit; name its speed here")
+        raise ConfigError(f"{where('control.actuator.no_load_speed')}: '{name}' has no velocity limit; give its speed here")
     return np.where(driven, stall, robot.torque_limits), np.where(driven, speed, np.inf)
 
 
 def with_rotors(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> Robot:
-    """Return the robot with the rotor inertias of the configuration (control.actuator.armature); without them, the same
-    robot. `where` turns a dotted path into the beginning of an error message.
+    """Return the robot with the rotor inertias of control.actuator.armature. Without such a setting, return the same robot.
+    `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -308,8 +308,8 @@ def friction_numbers(
 
 
 def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np.ndarray) -> np.ndarray:
-    """Return a number for each joint, (D,): the entry of the longest pattern of `table` in the joint's name, else the entry
-    of `otherwise` (D,).
+    """Return a number for each joint, (D,). The keys of `table` are patterns: the longest one that a joint's name contains
+    gives the number. If a name contains none, `otherwise` (D,) gives it.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -324,8 +324,8 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
     into the beginning of an error message.
 
     Raises:
-        ConfigError: a pattern matches no joint, a speed is missing, a motor is too strong for the physics step, or the
-            network file is missing or invalid, or needs the P law or another physics step.
+        ConfigError: a pattern matches no joint, a no-load speed is missing, a motor is too strong for the physics step, or
+            the network's file is missing or invalid, or needs the P law or another physics step.
     """
     actuator = cfg.actuator
     _check_line(with_rotors(robot, actuator, where), *motor_numbers(robot, actuator, where), sim_dt, where)
@@ -340,12 +340,12 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that no torque-speed line is given to ideal motors by mistake. The command line may set the model to `ideal`
-    where a file gives the numbers of a line, so that motors can be tried without it.
+    """Check that stall_torque and no_load_speed, which ideal motors ignore, are not given for ideal motors by mistake. If a
+    file gives these numbers, the command line may set control.actuator.model to `ideal`, to try motors without them.
 
     Raises:
-        ConfigError: numbers of a line are given and the motor model is not set, or the command line gives the numbers and
-            does not set the model to `ideal` as well.
+        ConfigError: the numbers are given but the motor model is not set, or the command line gives the numbers but does not
+            set the model too.
     """
     path, told = "control.actuator.model", origins.of("control.actuator.model")
     for name in ("stall_torque", "no_load_speed"):
@@ -362,11 +362,11 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
 def check_slowest(
     robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
 ) -> None:
-    """Check that torque-speed lines fit the physics step if no-load speeds are randomised, at the `lowest` factor on them.
-    `where` turns a dotted path into the beginning of an error message.
+    """Check that no torque-speed line is too steep for the physics step if randomisation multiplies no-load speeds by
+    `lowest`. `where` turns a dotted path into the beginning of an error message.
 
     Raises:
-        ConfigError: at that factor a motor is too strong for the physics step, as for `check_actuator`.
+        ConfigError: a line is too steep.
     """
     gain = _line_gains(with_rotors(robot, cfg.actuator, where), *motor_numbers(robot, cfg.actuator, where), sim_dt)
     i = int(np.argmax(gain))
@@ -374,14 +374,14 @@ def check_slowest(
         least = math.ceil(100.0 * gain[i] / LARGEST_GAIN) / 100.0
         raise ConfigError(
             f"{where('domain_rand.ranges.velocity_limit')}: its lowest value, {lowest:g}, makes the torque-speed line of "
-            f"'{robot.joint_names[i]}' so steep that in physics steps of {sim_dt:g} s it would push and brake in turn "
-            f"(control.actuator.model dc_motor); must be at least {least:g}"
+            f"'{robot.joint_names[i]}' so steep that in physics steps of {sim_dt:g} s the motor would push and brake "
+            f"in turn (control.actuator.model dc_motor); must be at least {least:g}"
         )
 
 
 def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float) -> np.ndarray:
-    """Return the gain of each torque-speed line, (D,): the change of speed of a joint in the air within a physics step,
-    divided by the distance of its speed from the line. It is 0 for ideal motors, whose no-load speed is infinite.
+    """Return the gain (see LARGEST_GAIN) of each torque-speed line, (D,), for joints of legs in the air. It is 0 for ideal
+    motors, because their no-load speed is infinite.
     """
     return sim_dt * stall / (robot.inertia * speed)
 
@@ -389,8 +389,8 @@ def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
 def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
     """Check that no torque-speed line is too steep for the physics step.
 
-    On a line with a gain above LARGEST_GAIN a joint in the air changes its speed, within a physics step, by more than twice
-    its distance from the line. Such a motor pushes and brakes in turn.
+    With a gain above LARGEST_GAIN, a joint in the air overshoots the no-load speed in a physics step by more than it was off
+    before. The motor then pushes and brakes in turn.
 
     Raises:
         ConfigError: a line is too steep.
@@ -402,8 +402,8 @@ def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
     name, inertia = robot.joint_names[i], robot.inertia[i]
     rotor = robot.armature[i] + stall[i] * sim_dt / (LARGEST_GAIN * speed[i]) - inertia
     raise ConfigError(
-        f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, by a motor "
-        f"of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would push and "
-        f"brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), or make "
-        f"sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # factors round two digits to the safe side
+        f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, too little "
+        f"for a motor of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would "
+        f"push and brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), "
+        f"or make sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # 1.06 and 0.94 outweigh rounding
     )

@@ -26,13 +26,12 @@ FORMAT = 1
 WIDEST, DEEPEST = 1024, 16
 """Largest number of units in a layer, and of layers."""
 TOLERANCE = 1e-3
-"""Largest difference between the time of a network's sample and a whole number of physics steps, as a share of a physics
-step."""
+"""Largest deviation of the time between samples from a whole number of physics steps, in physics steps."""
 
 
 @dataclass(frozen=True)
 class NetworkWeights:
-    """Contents of a file of a learned actuator (.npz, without code)."""
+    """Contents of the file of a learned actuator (.npz, without pickled objects)."""
 
     kind: str
     """`mlp` or `lstm`."""
@@ -51,7 +50,7 @@ class NetworkWeights:
     """Figures of the fit, such as its error on held-out data."""
 
     def save(self, path: Path) -> None:
-        """Write the file."""
+        """Write the weights to the file `path`."""
         arrays = {f"layer{i}.{name}": array for i, layer in enumerate(self.layers) for name, array in layer.items()}
         facts = {f"fact.{name}": np.array(value) for name, value in self.facts.items()}
         header = {"format": FORMAT, "kind": self.kind, "dt": self.dt, "samples": self.samples, "scales": self.scales}
@@ -60,7 +59,7 @@ class NetworkWeights:
 
     @classmethod
     def load(cls, path: str | Path, where: str = "control.actuator.network") -> "NetworkWeights":
-        """Read a file. `where` is the beginning of error messages.
+        """Read the weights from the file `path`. `where` is the beginning of error messages.
 
         Raises:
             ConfigError: the file is missing, or is not a file of a learned actuator.
@@ -101,11 +100,12 @@ class NetworkWeights:
         return weights
 
     def _check(self) -> None:
-        """Check that layers fit each other.
+        """Check the header, and that the layers fit each other.
 
         Raises:
             KeyError: an array is missing.
-            ValueError: a layer does not fit the previous one, or has non-finite weights.
+            ValueError: the header is invalid, a layer does not fit the previous one or has non-finite weights, or the network
+                returns more than one number.
         """
         if not (self.dt > 0.0 and self.samples > 0 and self.scales.shape == (3,) and 0 < len(self.layers) <= DEEPEST):
             raise ValueError("its header has invalid values")
@@ -130,10 +130,10 @@ class NetworkWeights:
         """
         steps = round(self.dt / sim_dt)
         if steps < 1 or abs(self.dt / sim_dt - steps) > TOLERANCE or (self.kind == "lstm" and steps != 1):
-            allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} or a whole part of it"
+            allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} divided by a whole number"
             raise ConfigError(
                 f"{where}: was trained on samples {self.dt:g} s apart, which does not fit physics steps of sim.dt={sim_dt:g};"
-                f" sim.dt must be {allowed} (fit_actuator --dt trains for another one)"
+                f" sim.dt must be {allowed} (fit_actuator --dt sets the time between samples)"
             )
         return steps
 
@@ -180,8 +180,8 @@ class ActuatorNetwork:
             self._found = torch.zeros(self._shape, device=device)
 
     def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
-        """Return the torques (N, D) [N m] of this physics step, for errors, target minus angle [rad], and velocities [rad/s],
-        (N, D) each.
+        """Return the torques (N, D) [N m] of this physics step. `error` (N, D) is the target minus the joint angle [rad],
+        `dof_vel` (N, D) the joint velocity [rad/s].
         """
         if self._kernels is not None:
             net = (self._weights, self._widths, self.state, self._scratch, self._found)
@@ -198,7 +198,7 @@ class ActuatorNetwork:
             self.state[:, 1:].copy_(self.state[:, :-1].clone())
         torch.mul(error, self._position, out=self.state[:, 0, 0])
         torch.mul(dof_vel, self._velocity, out=self.state[:, 0, 1])
-        # Rows: all errors, then all velocities, newest first. Columns: joints of robots.
+        # Rows are the errors of all samples, then the velocities, newest first. Columns are the joints of all robots.
         x = self.state[:, :: self._every].permute(2, 1, 0, 3).reshape(2 * self._samples, self._rows)
         for layer in self._layers[:-1]:
             x = torch.nn.functional.softsign(torch.addmm(layer["bias"].unsqueeze(1), layer["weight"], x))

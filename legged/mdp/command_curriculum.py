@@ -32,9 +32,9 @@ class CommandCurriculum:
         device = full_ranges.device
         self.share = torch.ones(3, device=device)
         """(3,) share of the full range that is in use."""
-        # These are views of one tensor, so that one launch clears a window.
+        # The sums and the count are views of one tensor, so that one launch clears a window.
         self._window = torch.zeros(7, device=device)
-        self._sums = self._window[:6].view(2, 3)  # velocity reached in the commanded direction, commanded velocity
+        self._sums = self._window[:6].view(2, 3)  # rows: velocity in the commanded direction, commanded velocity
         self._steps = self._window[6]
         self._zero = torch.zeros((), device=device)
         self.reset()
@@ -72,7 +72,7 @@ class CommandCurriculum:
         self._window.masked_fill_(due, 0.0)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return the current widest command of each axis as fresh 0-dimensional tensors, by name in TensorBoard."""
+        """Return the largest command that each axis allows now, by name in TensorBoard, as new 0-dimensional tensors."""
         if not self.cfg.enabled:
             return {}
         names = ("command_vx", "command_vy", "command_yaw")

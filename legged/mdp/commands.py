@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a command counts as motion."""
 STANDING = 4
-"""Index of the kind of command that stands still."""
+"""Index of the kind of command for which a robot stands still."""
 HEADING_GAIN = 0.5
 """Yaw rate per heading error in heading mode [1/s]."""
 

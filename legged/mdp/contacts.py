@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""
 SHARE_OF_WEIGHT = 0.01
-"""Threshold of a contact for lighter robots, as a share of their weight. A robot of 400 g could hardly reach 1 N per foot."""
+"""Threshold of a contact for robots below 100 N, as a share of their weight. Feet of a 400 g robot hardly ever reach 1 N."""
 GRAVITY = 9.81
 """Acceleration of gravity, for weights [m/s^2]."""
 
@@ -45,12 +45,12 @@ class FeetContacts:
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
         self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)
-        """(N, F) True if the foot is on the ground; True if it touched down at this step."""
+        """(N, F) masks of the feet that are on the ground, and of those that touched down at this step."""
         self.air_time, self.last_air_time = self._times.unbind(dim=1)
         """(N, F) duration of the current swing, 0 in contact; and duration of the last finished swing [s]."""
 
     def update(self, feet_forces: Tensor) -> None:
-        """Advance by one control step; `feet_forces` (N, F, 3) in the world frame [N]."""
+        """Advance by one control step. `feet_forces` (N, F, 3) are the contact forces of the feet in the world frame [N]."""
         if self._kernels is not None:
             times = (self.air_time, self.last_air_time)
             flags = (self.in_contact, self.first_contact, self._touching)
@@ -61,7 +61,7 @@ class FeetContacts:
         self._touching.copy_(touching)
         torch.logical_and(
             self.air_time, self.in_contact, out=self.first_contact
-        )  # an air time above 0: the foot was in the air
+        )  # an air time above 0 means that the foot was in the air
         self.air_time.add_(self.dt)
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         self.air_time.masked_fill_(self.in_contact, 0.0)

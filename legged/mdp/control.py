@@ -1,4 +1,4 @@
-"""Control laws: actions to joint torques."""
+"""Control laws, which compute joint torques from actions."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -27,7 +27,7 @@ class Control:
     V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
     T: action_scale * action
 
-    Each joint has one of them. A of D joints have an action. The others are held: the law takes 0 as their action.
+    Each joint has one of these laws. Of the D joints, A have an action. The others are held: the law takes 0 as their action.
     """
 
     STATE = ("_last_dof_vel",)
@@ -41,8 +41,8 @@ class Control:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Build the control law on the device of `torques` (N, D), the physics' tensor that the law writes. Gains come from
-        `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
+        """Build the control law. It writes to `torques` (N, D), a tensor of the physics, and uses the device of this tensor.
+        Gains come from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
 
         Raises:
             ConfigError: a pattern matches no joint, a joint has no law, gain or scale, or joints are held by another law
@@ -62,7 +62,7 @@ class Control:
         """(A,) index of each action's joint."""
         scales = action_scales(robot, cfg)
         self.action_scale = cfg.action_scale if isinstance(cfg.action_scale, float) else tensor(scales)
-        """Scale of all actions, or (A,) of each."""
+        """One scale for all actions, or (A,) one for each."""
         stiffness, damping = control_gains(robot, cfg)
         self.stiffness, self.damping = tensor(stiffness), tensor(damping)
         """(D,) gains [N m/rad] and [N m s/rad]. These gains and `torque_limits` [N m] become (N, D) once `vary` randomises
@@ -76,9 +76,9 @@ class Control:
         self.zero_dof_pos = self.default_dof_pos
         """(D,) or (N, D) true joint angles at which encoders show the default angles [rad]."""
         self.nominal = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
-        """Name in `vary` -> nominal gains or limits (D,), which `vary` multiplies by its factors. They never change."""
+        """Property that `vary` randomises -> its nominal values (D,), which `vary` multiplies by the drawn factors."""
         self._varied = False
-        self._target = torch.zeros_like(self.torques)  # joint angles, velocities or torques
+        self._target = torch.zeros_like(self.torques)  # joint angles (P), velocities (V) or torques (T)
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
         self.actuator: Actuator | None = None
@@ -173,7 +173,7 @@ class Control:
         return torques
 
     def reset(self, mask: Tensor) -> None:
-        """Reset the state of law and actuators of the robots in `mask` (N,)."""
+        """Reset the control law and the actuators of the robots in `mask` (N,)."""
         if "V" in self._has:
             masked_set_(self._last_dof_vel, mask, 0.0)
         if self.actuator is not None:
@@ -181,8 +181,8 @@ class Control:
 
 
 def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> None:
-    """Check that no wheel with an action is turned to an angle. `where` turns a dotted path into the beginning of an error
-    message.
+    """Check that all wheels with the law P are held, because P would turn them to an angle. `where` turns a dotted path into
+    the beginning of an error message.
 
     Raises:
         ConfigError: a wheel has the law P and is not held.
@@ -191,8 +191,8 @@ def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], 
     for i in acted:
         if robot.wheels[i] and laws[i] == "P":
             raise ConfigError(
-                f"{where('control.control_type')}: '{robot.joint_names[i]}' of '{robot.name}' is a wheel; P would turn it to"
-                " an angle, which is not observed: a table (pattern: law) gives it V or T, and control.held holds it"
+                f"{where('control.control_type')}: '{robot.joint_names[i]}' of '{robot.name}' is a wheel, and law P would"
+                " turn it to an angle that is not observed; give it law V or T in a table, or list it in control.held"
             )
 
 

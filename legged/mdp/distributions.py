@@ -17,8 +17,8 @@ KINDS = ("uniform", "log_uniform", "gaussian")
 
 
 def standard_deviation(draw: DrawConfig) -> float:
-    """Return the standard deviation of a normal distribution before it is cut off at its range: `std` of the draw, or a
-    quarter of the range's width.
+    """Return the standard deviation of a normal distribution before it is cut off at the ends of its range: `draw.std`, or a
+    quarter of the range's width if that is 0.
     """
     return draw.std or 0.25 * (draw.range[1] - draw.range[0])
 
@@ -34,9 +34,9 @@ class Distributions:
         steps_per_iteration: int = 1,
         within: bool = True,
     ) -> None:
-        """Configure the columns. A range with `grow` widens over training from the `neutral` value (V,) of its column. With
-        `within`, it starts from the number in the range that is nearest to that value. `steps_per_iteration` is the number of
-        control steps in a training iteration.
+        """Configure the columns. A range with `grow` widens over training, starting from the column's value in `neutral`
+        (V,). With `within`, it starts from the nearest end of the range if the neutral value is outside.
+        `steps_per_iteration` is the number of control steps in a training iteration.
         """
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
         ordered = [columns[i] for i in self._order]
@@ -93,7 +93,7 @@ class Distributions:
         return self.values(even, torch.zeros((), device=even.device))
 
     def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: "TaskKernels | None") -> None:
-        """Write `values` into `out` (N, V), by one launch if `kernels` are given."""
+        """Write into `out` (N, V) what `values` would return, by one launch if `kernels` are given."""
         if kernels is None:
             out.copy_(self.values(even, steps))
         else:
@@ -101,7 +101,7 @@ class Distributions:
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
         """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.
-        Ranges have widened for `steps` () of training.
+        `steps` () is the number of control steps for which ranges have widened.
         """
         parts = list(even.split(self._counts, dim=1))
         if self._counts[1]:
@@ -112,7 +112,7 @@ class Distributions:
         if self._back is not None:
             drawn = drawn.index_select(1, self._back)
         if any(self._counts[1:]):
-            drawn = torch.clamp(drawn, self._least, self._most)  # rounding must not leave the range
+            drawn = torch.clamp(drawn, self._least, self._most)  # rounding may exceed the range slightly
         if self._pace is None:
             return drawn
         share = torch.addcmul(self._pace[1], self._pace[0], steps).clamp_(0.0, 1.0)
@@ -124,7 +124,7 @@ def _ends(draw: DrawConfig) -> tuple[float, float]:
     low, high = draw.range
     if draw.distribution == "log_uniform":
         return math.log(low), math.log(high)
-    if draw.distribution == "gaussian":  # torch.erfinv, which gives normal numbers, is infinite at +-1
+    if draw.distribution == "gaussian":  # `values` applies torch.erfinv, which is infinite at +-1
         reach = 0.5 * (high - low) / standard_deviation(draw) if high > low else 0.0
         end = min(math.erf(reach / math.sqrt(2.0)), 1.0 - 1e-6)
         return -end, end

@@ -29,11 +29,11 @@ class Kicks:
 
     STATE = ("time_left",)
     WIDTH = 7
-    """Random columns of a kick: 6 for the change of velocity, 1 for the time until the next kick."""
+    """Number of random columns of a kick: 6 for the change of velocity, 1 for the time until the next kick."""
 
     def __init__(self, cfg: KickConfig, dt: float, time_left: Tensor) -> None:
-        """Spread the first kicks over the longest interval. `dt` is the control step [s]; `time_left` (N,) is written in
-        place.
+        """Draw the times of the first kicks, between 0 and the longest interval. `dt` is the control step [s]; `time_left`
+        (N,) is written in place.
         """
         self.columns, self.start = _columns(cfg, (*AXES, *TURNS), ("interval_s",))
         """Distribution of each random column, and the value that its range starts from."""
@@ -43,13 +43,13 @@ class Kicks:
         time_left.copy_(uniform(0.0, cfg.interval_s[1], (len(time_left),), time_left.device))
 
     def take(self, drawn: Tensor) -> None:
-        """Set the tensor `drawn` (N, 7) that holds each robot's next kick: its velocity [m/s, rad/s] and the interval after
-        it [s].
+        """Use the tensor `drawn` (N, 7), which holds each robot's next kick: the change of velocity [m/s, rad/s], and the
+        interval between this kick and the one after it [s].
         """
         self.velocity, self._next = drawn[:, :6], drawn[:, 6]
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Kick the robots of `mask` (N,) that are due."""
+        """Kick the robots that are due, but only robots in `mask` (N,)."""
         self.time_left.sub_(self._dt)
         due = (self.time_left <= 0.5 * self._dt) & mask
         physics.push(due, self.velocity)
@@ -61,11 +61,11 @@ class Forces:
 
     STATE = ("left", "force")
     WIDTH = 5
-    """Random columns of a push: 3 for the force, 1 for the interval, 1 for the duration."""
+    """Number of random columns of a push: 3 for the force, 1 for the interval, 1 for the duration."""
 
     def __init__(self, cfg: ForceConfig, body: int, dt: float, left: Tensor, force: Tensor) -> None:
-        """Push the body with index `body` in the model. The first pushes are spread over a whole interval. `dt` is the
-        control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
+        """Push the body with index `body` in the model. The first pushes begin at random times within the longest interval.
+        `dt` is the control step [s]; `left` (N, 2) and `force` (N, 3) are written in place.
         """
         self.columns, self.start = _columns(cfg, AXES, ("interval_s", "duration_s"))
         """Distribution of each random column, and the value that its range starts from."""
@@ -75,11 +75,11 @@ class Forces:
         left[:, 1] = uniform(0.0, cfg.interval_s[1], (len(left),), left.device)
 
     def take(self, drawn: Tensor) -> None:
-        """Set the tensor `drawn` (N, 5) that holds each robot's next push: its force [N], interval [s] and duration [s]."""
+        """Use the tensor `drawn` (N, 5), which holds each robot's next push: its force [N], interval [s] and duration [s]."""
         self.drawn = drawn
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Begin and end the pushes that are due. Pushes of robots outside `mask` (N,) end."""
+        """Begin pushes that are due, and end those whose time is over and all those of robots outside `mask` (N,)."""
         assert physics.forces is not None
         self.left.sub_(self._dt)
         passed = self.left <= 0.5 * self._dt
@@ -92,7 +92,7 @@ class Forces:
 
 
 class Disturbances:
-    """All kicks and forces of a task. Their numbers share tensors, so that one launch handles all of them."""
+    """All kicks and forces of a task. They use columns of the same tensors, so that one launch handles all of them."""
 
     def __init__(
         self,
@@ -102,8 +102,8 @@ class Disturbances:
         steps_per_iteration: int,
         numbers: RandomPool,
     ) -> None:
-        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]; `steps_per_iteration` is the number of
-        control steps in a training iteration; ranges widen by iterations. Random numbers come from the pool `numbers`.
+        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]. `steps_per_iteration` is the number of
+        control steps in a training iteration, because `grow` counts iterations. Random numbers come from the pool `numbers`.
         """
         self._dt, self._kernels = dt, physics.kernels
         num_envs, device = numbers.num_envs, numbers.device
@@ -148,14 +148,14 @@ class Disturbances:
         self._no_forces = torch.zeros(num_envs, 0, 6, device=device)
 
     def draw(self) -> None:
-        """Draw the next disturbances of every robot. This runs on a parallel stream of the step, and does nothing if there
-        are no disturbances.
+        """Draw the next disturbances of every robot. This runs in parallel with other parts of the step, and does nothing if
+        there are no disturbances.
         """
         if self._all:
             self._draws.write(self._even.values, self.steps, self._drawn, self._kernels)
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Apply the disturbances that are due to the robots of `mask` (N,), whose episodes continue."""
+        """Apply all disturbances that are due. They affect only robots in `mask` (N,), whose episodes continue."""
         if not self._all:
             return
         if self._kernels is not None:
@@ -174,14 +174,14 @@ class Disturbances:
         self.steps.add_(1.0)
 
     def end(self, physics: Physics) -> None:
-        """End all pushes. Called outside a step, when all robots begin a new episode."""
+        """End all pushes. The task calls this outside a step, when all robots begin a new episode."""
         if physics.forces is not None:
             physics.forces.zero_()
         for force in self.forces.values():
             force.force.zero_()
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the number of steps for which ranges have widened; empty without disturbances."""
+        """Return the number of steps for which ranges have widened; {} if there are no disturbances."""
         return {"steps": self.steps.clone()} if self._all else {}
 
     def load_progress(self, progress: dict[str, Tensor]) -> None:

@@ -21,7 +21,7 @@ def is_exact(cfg: HeightMapConfig) -> bool:
 
 
 class HeightMapErrors:
-    """Height maps of N robots with errors: the map is displaced from the ground, the displacement drifts, and some of P
+    """Height maps of N robots, with errors: a map is displaced from the ground, the displacement drifts, and some of its P
     points are unknown.
     """
 
@@ -37,7 +37,7 @@ class HeightMapErrors:
         numbers: RandomPool,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Read heights around the `pose` of bases, positions (N, 3) and orientations (N, 4) in the world frame.
+        """Set up maps around the bases. `pose` has their positions (N, 3) [m] and orientations (N, 4) in the world frame.
 
         If the map can be displaced horizontally, this object updates `scan`, so no other object may use it. Otherwise the
         heights that `scan` holds are used. `seen` turns ground heights (N, P) in the world frame into the observation. `dt`

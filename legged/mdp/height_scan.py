@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 class HeightScan:
     """Ground heights at a grid of P points around each robot, turned with its heading. On a plane all heights are 0.
 
-    terrain.scan chooses how the cells around a point give its height (HeightMap.scan_map). The ground under the base is such
-    a point too.
+    terrain.scan chooses how the cells around a point give its height (HeightMap.scan_map). The height of the ground under the
+    base is looked up in the same way.
     """
 
-    STATE: tuple[str, ...] = ()  # heights follow from the robots' poses
+    STATE: tuple[str, ...] = ()  # nothing to save: heights follow from the robots' poses
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class HeightScan:
             self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
             self._last = [float(size - 1) for size in found.shape]
             self._map = found.flatten()
-            # In cells. The last point is the base's own position, so that one lookup finds all heights.
+            # These coordinates are in cells. The last point is the base's own position, so that one lookup finds all heights.
             self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 
     def update(self, base_pos: Tensor, base_quat: Tensor) -> None:

@@ -23,8 +23,8 @@ class Metrics:
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Build empty sums for the metrics in `functions`, each returning (N,). Reward sums of episodes are divided by
-        `reward_unit` before they are averaged: legged_gym logs them per second of a full episode.
+        """Set all sums to zero. `functions` are the metrics, each returning (N,). Reward sums of episodes are divided by
+        `reward_unit` before they are averaged, because legged_gym logs them per second of a full episode.
         """
         self._functions = dict(functions)
         self.reward_names, self.termination_names = tuple(reward_names), tuple(termination_names)
@@ -34,7 +34,7 @@ class Metrics:
         self._metrics = torch.zeros(len(self._functions), num_envs, device=device)
         # The rows are: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
         self._counts = torch.zeros(3 + len(self.termination_names), num_envs, device=device)
-        self._ended = torch.zeros(2, num_envs, device=device)  # episodes, falls
+        self._ended = torch.zeros(2, num_envs, device=device)  # rows: episodes, falls
         self._lengths = torch.zeros(num_envs, device=device)
         self._rewards = torch.zeros(len(self.reward_names), num_envs, device=device)
         self._always = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -67,7 +67,7 @@ class Metrics:
         self._rewards.add_(torch.where(ended, reward_sums, self._zero))
 
     def flush(self) -> dict[str, Tensor]:
-        """Return means since the last flush as fresh 0-dimensional tensors, by name in TensorBoard, then clear all sums."""
+        """Return means since the last flush, by name in TensorBoard, as new 0-dimensional tensors. Then clear all sums."""
         all_steps, steps, overflows, *ended = self._counts.sum(dim=1).unbind()
         episodes, falls = self._ended.sum(dim=1).unbind()
         metrics, rewards = self._metrics.sum(dim=1).unbind(), (self._rewards.sum(dim=1) / self.reward_unit).unbind()

@@ -27,11 +27,12 @@ MirrorKind = Literal[
     "vectors",
     "of_joints",
 ]
-"""Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`:
-(x, y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`, `angles` (joints without wheels), `actions`,
-`passive` (joints), `feet`: a number for each; `heights`: the height scan; `same`: numbers without a side; `scalar`: one
-number without a side; `sideways`: one number that is positive to the left; `vectors`: several vectors, (x, y, z) each;
-`of_joints`: a property of each joint that has no side, or one number for all joints."""
+"""Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`: (x,
+y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`: one number for each joint; `angles`: the same without
+wheels; `actions`: one for each action; `passive`: one for each passive joint; `feet`: one for each foot; `heights`: the
+height scan; `same`: numbers that mirroring does not change; `scalar`: one such number; `sideways`: one number that is
+positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: a property of each joint whose sign mirroring
+does not change, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector, so its y component keeps its sign."""
 
@@ -96,8 +97,8 @@ class MirrorImages:
         return columns, signs
 
     def _image_of(self, kind: str, width: int) -> Image:
-        """Return the image of a kind of term. The kind determines the number of columns, except that `same`, `vectors` and
-        `of_joints` use `width`.
+        """Return the image of a term of this kind. Only `same`, `vectors` and `of_joints` read `width`, the term's number of
+        columns; the other kinds determine this number.
         """
         if kind in SIGNS:
             return torch.arange(len(SIGNS[kind])), torch.tensor(SIGNS[kind])
@@ -132,9 +133,9 @@ class MirrorImages:
 
 
 def mirror_of_actions(mirror: Mirror, acted: Sequence[int]) -> tuple[list[int], list[float]] | None:
-    """Return, for each action of the joints `acted`, the index of the action on the other side, and the sign between the two.
+    """Return for each action of the joints `acted` the index of its mirror image, and the sign of the image, as two lists.
 
-    Return None if a joint has an action and its partner on the other side has none.
+    Return None if a joint has an action but its partner on the other side has none.
     """
     number = {joint: i for i, joint in enumerate(acted)}
     if any(mirror.joints[joint] not in number for joint in acted):

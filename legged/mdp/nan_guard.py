@@ -18,14 +18,16 @@ LARGEST_STATE = 1e4
 
 
 class NanGuard:
-    """Record of the robots, out of N, that had a non-finite number since the last `flush`, by the term at fault. Numbers
-    beyond LARGEST or LARGEST_STATE count as non-finite.
+    """Record of non-finite numbers since the last `flush`: for each term, which of N robots had one. Numbers beyond LARGEST
+    or LARGEST_STATE count as non-finite.
     """
 
     STATE = ("sound",)
 
     def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
-        """Watch the reward terms named `rewards`, in the order of their rows, and the terms of `observations`."""
+        """Watch the reward terms named `rewards`, in the order of the rows in `check_rewards`, and the terms of
+        `observations`.
+        """
         self.outputs_finite = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
         the next step."""
@@ -33,10 +35,10 @@ class NanGuard:
         """The tensor `outputs_finite`, under its name in saved states."""
         self._terms = observations
         self._names = ("physics", "action", *(f"reward_{n}" for n in rewards), *(f"obs_{n}" for n in observations.columns))
-        self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # physics, action
+        self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # rows: physics, action
         self._seen = torch.zeros_like(self._now)
         self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
-        # This records the largest size of each observation column, in two launches per step. `flush` counts the robots.
+        # Largest absolute value of each observation column, recorded in two launches per step. `flush` counts the robots.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
@@ -66,7 +68,7 @@ class NanGuard:
         torch.maximum(self._largest, size, out=self._largest)
 
     def flush(self) -> dict[str, Tensor]:
-        """Return the number of robots with each fault as fresh 0-dimensional tensors, by name in TensorBoard, then clear the
+        """Return the number of robots with each fault, by name in TensorBoard, as new 0-dimensional tensors. Then clear the
         record. The number is NaN for a fault that no robot had.
         """
         broken = [~(self._largest[:, columns].amax(dim=1) < LARGEST) for columns in self._terms.columns.values()]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from legged.mdp.observations import ObservationTerms
 
 HEIGHTS = "heights"
-"""Name of the term that is read from a map."""
+"""Name of the term that is read from the height map."""
 
 
 class ObservationErrors:
@@ -130,7 +130,7 @@ class ObservationErrors:
         return ", ".join(parts)
 
     def parts(self) -> dict[str, "ObservationErrors | HeightMapErrors"]:
-        """Return the parts that have a `STATE`, by their names in saved states."""
+        """Return the parts with tensors to save (`STATE`), by their names in saved states."""
         return {"sensors": self, **({"height_map": self._map} if self._map is not None else {})}
 
     def _draw(self, begun: Tensor) -> None:
@@ -161,7 +161,7 @@ class ObservationErrors:
         return now
 
     def _late(self, past: Tensor, delay: Tensor) -> Tensor:
-        """Return the entries (N, C) of `past` (N, steps, C) at the age `delay` (N, T)."""
+        """Return the values (N, C) in `past` (N, steps, C) that are `delay` (N, T) steps old."""
         age = delay.index_select(1, self._term_of).unsqueeze(1)
         return past.gather(1, age)[:, 0]
 

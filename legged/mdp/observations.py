@@ -41,7 +41,7 @@ class ObservationTerms:
         self.raw = self.values
         """(N, width) terms as their functions returned them, NaN and infinite numbers included."""
         self.errors: ObservationErrors | None = None
-        """Bias, delay and loss of terms, for groups with noise; None without them."""
+        """Errors of terms (bias, delay, loss) for groups with noise; None if no term has errors."""
 
     def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
         """Evaluate all terms into `raw` and `values`, then update `errors` by a control step.
@@ -95,9 +95,8 @@ class ObservationGroup:
     ) -> None:
         """Build the group of the terms `names` of `source`, in that order.
 
-        `scales` and `noise` (half widths in the term's unit, before scaling) have entries by term; without one, the scale is
-        1 and there is no noise. The scaled values are clipped to plus and minus `clip`. Noise is drawn from the pool
-        `numbers`.
+        `scales` and `noise` (half widths in the term's unit, before scaling) have entries by term. A missing entry means the
+        scale 1, or no noise. Scaled values are clipped to plus and minus `clip`. Noise is drawn from the pool `numbers`.
         """
         self.clip, self.history = clip, history
         self.terms: list[ObservationTerm] = []

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 VARIANTS = 1024
-"""Number of model variants that worlds choose from, if masses, inertias or armatures change within steps. MuJoCo derives
-constants from these fields, which is impossible within a step. So variants are drawn at the start, with their constants."""
+"""Number of variants of the model from which worlds choose if masses, inertias or armatures have `when: reset` or `interval`.
+MuJoCo derives constants from these fields, which is impossible within a step. So all variants are drawn at the start, and
+their constants are derived then."""
 
 
 class Randomization:
-    """Random properties of the model and of the control law: a number per world and field, or one for each row of the
-    field.
+    """Random properties of the model and of the control law. In each world, a field has one number, or one for each of its
+    rows (joints, bodies or shapes).
     """
 
     STATE: tuple[str, ...] = ("drawn",)
@@ -55,8 +56,8 @@ class Randomization:
             self.STATE = ("drawn", "steps")
 
     def _draws(self, names: Collection[str], widths: Mapping[str, int] | None = None, pace: int = 1) -> Distributions:
-        """Return the distributions of the fields `names`, with `widths` columns each (else 1). `pace` is the number of
-        control steps in a training iteration.
+        """Return the distributions of the fields `names`. `widths` has the number of columns of each field; a missing entry
+        means 1. `pace` is the number of control steps in a training iteration.
         """
         wide = [name for name in names for _ in range((widths or {}).get(name, 1))]
         neutral = [FIELDS[name].neutral for name in wide]
@@ -101,20 +102,20 @@ class Randomization:
         return {name: self._of(name) if self.is_each(name) else self._of(name)[:, 0] for name in self.draws}
 
     def apply(self, physics: Physics) -> None:
-        """Write the drawn values into the physics. Called at the start, and after a saved state was loaded."""
+        """Write the drawn values into the physics. The task calls this at the start, and after a saved state was loaded."""
         for field, values in self.fields.items():
             if field in MODEL_FIELDS and field not in self.chosen_fields:
                 physics.randomize(field, values)
         if self.chosen_fields:
-            if self._given is None or not torch.equal(self._given, self.variants):  # deriving constants is slow
+            if self._given is None or not torch.equal(self._given, self.variants):  # avoids slow derivations of constants
                 widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
                 physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
                 self._given = self.variants.clone()
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
     def prepare(self, physics: Physics, numbers: RandomPool, dt: float, steps_per_iteration: int) -> None:
-        """Allocate buffers for draws within control steps of `dt` [s], from the pool `numbers`. Does nothing if no field
-        changes within steps.
+        """Allocate buffers for draws during training, and reserve random numbers in the pool `numbers`. `dt` is the control
+        step [s]. Does nothing if all fields are drawn only once, at the start.
         """
         if not self.redrawn:
             return
@@ -125,7 +126,7 @@ class Randomization:
         self._even = self._own.ask(numbers) if self._own is not None else None
         self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
         self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
-        # New values lie in the order of `own`, then of the chosen fields. Moment 0 is "never", 1 a reset, 2 and on intervals.
+        # New values have the order of `own`, then of the chosen fields. Moment 0 means never, 1 resets, from 2 on intervals.
         intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
         order, place, moment = [*own, *self.chosen_fields], [], []
         starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))
@@ -156,8 +157,8 @@ class Randomization:
             physics.prepare_redraws(self.drawn, known, self._of_model)
 
     def draw(self) -> None:
-        """Draw new values for every world. `redraw` applies them to the worlds that are due. This runs on a parallel stream
-        of the step.
+        """Draw new values for every world. `redraw` applies them to the worlds that are due. This runs in parallel with other
+        parts of the step.
         """
         if not self.redrawn:
             return
@@ -177,8 +178,8 @@ class Randomization:
         torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
 
     def redraw(self, reset: Tensor) -> None:
-        """Apply the values of `draw`, within a step, to the worlds of `reset` (N,), whose episodes begin, and to worlds whose
-        interval has elapsed.
+        """Give the values that `draw` has drawn to the worlds of `reset` (N,), whose episodes begin, and to worlds whose
+        interval has elapsed. This runs within a step.
         """
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
@@ -200,7 +201,7 @@ class Randomization:
             physics.redraw(self._any_due)
 
     def _find_moments(self, reset: Tensor) -> None:
-        """Set `_due` to the moments that have come for each world, and count the step."""
+        """Mark in `_due` for each world which moments (resets, intervals) have come, and count the step."""
         self._due[:, 1].copy_(reset)
         if len(self._interval):
             self.steps_left.sub_(1.0)
@@ -210,7 +211,7 @@ class Randomization:
         self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the number of steps for which ranges have widened, for any number of worlds; empty if no range widens."""
+        """Return the number of steps for which ranges have widened; {} if no range widens."""
         return {"steps": self.steps.clone()} if any(draw.grow[1] > 0.0 for draw in self.draws.values()) else {}
 
     def load_progress(self, progress: Mapping[str, Tensor]) -> None:
@@ -228,8 +229,8 @@ class RobotRandomization(Randomization):
         num_envs: int,
         device: torch.device,
     ) -> None:
-        """Draw friction from `friction_buckets` values, and the mass added to the base, even if they are switched off. Then
-        draw the properties of `cfg.ranges`. If `cfg.ranges` names one of the first two, it takes precedence.
+        """Draw friction (one of `friction_buckets` values) and the mass added to the base, even if they are switched off.
+        Then draw the properties of `cfg.ranges`. An entry for friction or added_base_mass there takes precedence.
         """
         low, high = cfg.friction_range
         buckets = uniform(low, high, (cfg.friction_buckets,), device)
@@ -263,8 +264,8 @@ class Pushes:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Spread the first pushes over a whole interval. `dt` is the control step [s]. Velocities are drawn from the pool
-        `numbers`.
+        """Draw the times of the first pushes, between 0 and one interval. `dt` is the control step [s]. Velocities are drawn
+        from the pool `numbers`.
         """
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
@@ -275,7 +276,7 @@ class Pushes:
         self._delta = torch.zeros(num_envs, 2, device=device)
 
     def push(self, physics: Physics, mask: Tensor) -> None:
-        """Push the robots in `mask` (N,) that are due: set the base's horizontal velocity, world frame, to the drawn one."""
+        """Push the robots in `mask` (N,) that are due: their base gets the drawn horizontal velocity, in the world frame."""
         if not self.cfg.push_robots:
             return
         if self._kernels is not None:

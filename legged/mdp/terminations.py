@@ -10,8 +10,8 @@ from legged.graph.step_graph import calling
 
 
 class Terminations:
-    """Termination terms of two kinds: failures, after which no reward is expected, and time-outs, whose value is
-    bootstrapped.
+    """Termination terms of two kinds: failures, after which no reward is expected, and time-outs, after which the learner
+    bootstraps with the value function.
     """
 
     def __init__(

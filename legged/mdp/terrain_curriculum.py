@@ -1,4 +1,4 @@
-"""Terrain curriculum: robots that walk far enough move to harder tiles, others to easier ones."""
+"""Terrain curriculum: robots that walk far move to harder tiles, robots that fall short move to easier ones."""
 
 from typing import TYPE_CHECKING
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class TerrainCurriculum:
-    """Tile of each robot. Its column (a terrain type) is fixed; its row (a level) changes with success.
+    """Tile of each robot. The column of the tile (a terrain type) is fixed; the row (a level) changes with success.
 
     The rule is legged_gym's. A robot that got further than half a tile from the middle of its tile moves up a level. A robot
     that got less than half as far as its command asked moves down. From the top level a robot goes to a random one.
@@ -30,7 +30,7 @@ class TerrainCurriculum:
         device: torch.device,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Spread robots evenly over the columns, at levels up to cfg.max_init_terrain_level."""
+        """Spread robots evenly over the columns, at random levels up to cfg.max_init_terrain_level."""
         self.enabled, self._kernels = cfg.curriculum, kernels
         self.rows, columns = terrain.origins.shape[:2]
         highest = cfg.max_init_terrain_level if cfg.curriculum else self.rows - 1
@@ -43,12 +43,12 @@ class TerrainCurriculum:
         """(N, 3) middle of each robot's tile, world frame [m]."""
         self.names = terrain.type_names
         kinds = torch.tensor([self.names.index(name) for name in terrain.types], device=device)
-        self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N)
+        self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N) for K types
         self._tiles = torch.tensor(terrain.origins, dtype=torch.float32, device=device).flatten(0, 1)
         self._count = columns
         self._far = 0.5 * min(terrain.tile_size)
         self._random = torch.zeros_like(self.levels)
-        self._sums = torch.zeros(3, len(self.names), device=device)  # per type: episodes, promoted, demoted
+        self._sums = torch.zeros(3, len(self.names), device=device)  # rows: episodes, promoted, demoted
         self._place()
 
     def reset(self) -> None:
@@ -92,7 +92,7 @@ class TerrainCurriculum:
         torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return fresh 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level
+        """Return new 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level
         and the shares of ended episodes that moved up and down. Shares are averaged over about the last ten calls, since one
         rollout ends few episodes of each type.
         """

@@ -315,7 +315,7 @@ def test_a_wrong_flag_is_one_line(tmp_path, flags, said, capsys):
         ({"layer1.weight": np.zeros((3, 3))}, "layer 1 does not fit"),
         ({"layer1.bias": None}, "'bias' is missing"),
         ({"layer0.weight": np.full((4, 6), np.nan)}, "layer 0 has weights that are NaN"),
-        ({"dt": 0.007}, "sim.dt must be 0.007 or a whole part of it"),
+        ({"dt": 0.007}, "sim.dt must be 0.007 divided by a whole number"),
     ],
 )
 def test_a_wrong_network_is_one_line(changes, said):

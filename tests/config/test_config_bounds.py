@@ -211,7 +211,7 @@ def test_weights_are_counted(network):
 
 def test_measuring_points_are_counted():
     grid = [("terrain.measured_points_x", [0.1] * 101), ("terrain.measured_points_y", [0.0] * 100)]
-    with pytest.raises(ConfigError, match=r"measured_points_x: with measured_points_y they are 10,100 points"):
+    with pytest.raises(ConfigError, match=r"measured_points_x: makes 10,100 points"):
         small_config(*grid)
 
 

@@ -188,7 +188,7 @@ def test_lopsided_measuring_points_are_refused(capsys):
 def test_actions_that_are_scaled_differently_on_both_sides_have_no_images():
     """Half the way for the same action: the mirrored action would ask the other leg for another angle."""
     scales = {"LF": 0.5, "LH": 0.5, "RF": 0.25, "RH": 0.5}
-    words = r"control\.action_scale: is not the same left and right \(LF_HAA 0\.5, RF_HAA 0\.25\); false learns without"
+    words = r"control\.action_scale: is not the same left and right \(LF_HAA 0\.5, RF_HAA 0\.25\); train\.algorithm"
     with pytest.raises(ConfigError, match=words):
         small_config(SYMMETRIC, ("control.action_scale", scales))
     small_config(("train.algorithm.symmetry", False), ("control.action_scale", scales))
