@@ -108,8 +108,8 @@ class Watch:
 
 
 def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.ndarray, contract: Contract) -> np.ndarray:
-    """Return the targets (D,) [rad] after clipping to the position limits, and then so that |kp (target - q) - kd dq| is
-    within the torque limits. Where both are not possible, the torque limits take precedence.
+    """Return targets (D,) [rad] that are clipped to the position limits, and then to the range in which the torque
+    kp (target - q) - kd dq stays within the torque limits. Where the two conflict, the torque limits count.
     """
     kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
     inside = np.clip(targets, *contract.position_limits.T)
