@@ -50,7 +50,7 @@ CLASSES = {
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """Task class; None for the class that the configuration names, or else for that of the task that it extends."""
+    """Task class; None if the configuration names it, or takes it from the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
@@ -84,7 +84,7 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 def import_tasks(name: str) -> None:
     """Register user-defined tasks: run the module with that name or path, or register the YAML file at that path. `name` may
-    hold several, separated by commas, such as the module of a class and a YAML file that uses it.
+    hold several, separated by commas, such as the module of a class and a YAML file that uses the class.
 
     Raises:
         ConfigError: a module or a file can't be found, or fails.
