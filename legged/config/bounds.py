@@ -44,14 +44,14 @@ def rescaled(unit: str, bounds: Bounds) -> Bounds:
 
 
 def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
-    """Return metadata of a map: term -> number. For another robot, a number is rescaled by the unit of the term's method
+    """Return metadata of a map: term -> number. Numbers are rescaled for another robot. A number has the unit of the method
     `<prefix><term>`, raised to `power`.
     """
     return {**bounds, "unit_of": (prefix, power)}
 
 
 def rescaled_by_entry(path: str, bounds: Bounds) -> Bounds:
-    """Return metadata of the map at the dotted `path`. Each of its entries has its own unit, by which it is rescaled."""
+    """Return metadata of the map at the dotted `path`. Each entry has its own unit, and is rescaled for another robot."""
     return {**bounds, "unit_of": (f"{path}.", 1)}
 
 

@@ -42,7 +42,7 @@ def shown(value: Any) -> str:
 
 
 def plain_path(key: Any) -> str:
-    """Return a key as part of a dotted path in an error. A key that is long or not printable is written as by `shown`."""
+    """Return a key as part of a dotted path in an error. A long or unprintable key is cut or escaped."""
     return key if isinstance(key, str) and key and key.isprintable() and len(key) <= SHOWN else shown(key)
 
 

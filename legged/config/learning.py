@@ -149,8 +149,8 @@ class RunnerConfig:
     save_interval: int = field(default=50, metadata=between(1, 1_000_000_000))
     """Iterations between two checkpoints."""
     evaluate_interval: int = field(default=0, metadata=between(0, 1_000_000_000))
-    """Iterations between two evaluations during training; 0 for none. They measure the policy without exploration, on
-    separate robots without disturbances."""
+    """Iterations between two evaluations during training; 0 for no evaluations. An evaluation measures the policy without
+    exploration, on separate robots without disturbances."""
     evaluate_share: float = field(default=0.03, metadata=UNIT)
     """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed this
     share is skipped, except the first and the last; 1 skips none."""
@@ -181,8 +181,8 @@ class RunnerConfig:
     """Record a film of the final policy for the report, which takes about ten seconds. There is no film if the training was
     stopped early, or if the machine cannot render."""
     logger: str = "tensorboard"
-    """Tracker in addition to TensorBoard: `tensorboard` for none, `wandb`, `neptune`, or module:Class of a writer that
-    extends rsl-rl's LogWriter."""
+    """Tracker in addition to TensorBoard: `wandb`, `neptune`, or module:Class of a writer that extends rsl-rl's LogWriter;
+    `tensorboard` for no other tracker."""
     logger_project: str = field(default="", metadata=NAME)
     """Project name for the tracker; the folder under logs/ when empty."""
 

@@ -1,6 +1,6 @@
 """Configuration of a legged robot that follows velocity commands. It extends the sections of every task.
 
-Fields that legged_gym (v1.0.2, arXiv 2109.11978) has too keep their defaults there.
+Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same defaults.
 """
 
 from dataclasses import dataclass, field, replace
@@ -180,8 +180,8 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """Terms that end an episode."""
 
     failures: tuple[str, ...] = field(default=("contact", "base_height", "tilt"), metadata=TERMS)
-    """Terms that count as failures. `contact`: the contact force on a `terminate_after_contacts_on` shape exceeds 1 N or, for
-    robots below 100 N, 1 % of their weight. `base_height` and `tilt`: limits min_base_height and max_tilt."""
+    """Terms that count as failures. `contact`: the contact force on a `terminate_after_contacts_on` shape exceeds 1 N, or for
+    robots lighter than 100 N, 1 % of the weight. `base_height` and `tilt`: limits min_base_height and max_tilt."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
     """Terms that count as time-outs. `left_terrain`: the robot left the map, which does not count as a failure."""
     min_base_height: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
@@ -259,9 +259,9 @@ class LeggedRewardsConfig(RewardsConfig):
     """Target of the swing time [s]. feet_air_time rewards longer swings and punishes shorter ones; single_stance is largest
     at this time."""
     feet_clearance_target: float = field(default=0.1, metadata=rescaled("m", between(0, 100)))
-    """Height of a swinging foot above the lowest foot from which feet_clearance measures deviations [m]."""
+    """Target of feet_clearance: height of a swinging foot above the lowest foot [m]."""
     base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))
-    """Base height from which base_height measures deviations [m]."""
+    """Target of base_height: height of the base above the ground [m]."""
     max_contact_force: float = field(default=500.0, metadata=rescaled("N", positive(LARGEST)))
     """Foot force above which feet_contact_forces punishes [N]."""
     soft_dof_pos_limit: float = field(default=1.0, metadata=positive(10))
@@ -308,7 +308,7 @@ class LeggedObservationsConfig(ObservationsConfig):
     heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))
     """Largest absolute value of an observed height [m]."""
     depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
-    """Largest observed depth of low ground [m]. It has an effect below heights_limit; 0 switches it off."""
+    """Largest observed depth of low ground [m]. It has an effect only below heights_limit; 0 switches it off."""
     once_trained: HeightLimitsConfig = field(default_factory=HeightLimitsConfig)
     """Limits of observed heights in play, evaluation and export, where they differ from those of the training."""
     height_map: HeightMapConfig = field(default_factory=HeightMapConfig)

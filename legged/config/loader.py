@@ -115,8 +115,8 @@ def _mark(source: Source) -> Any:
 def _parent(
     parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
 ) -> tuple[Path | Registered, str]:
-    """Return the configuration that `extends: parent` names, and its name. It is a file in the folder `beside`, else a
-    registered task, else a task of this package.
+    """Return the configuration that `extends: parent` names, and its name. The configuration is that of a file in the
+    folder `beside`, else of a registered task, else of a task of this package.
     """
     if not isinstance(parent, str) or not parent:
         raise ConfigError(f"{name}: extends: expected the name of a task or of a file next to this one, got {shown(parent)}")
@@ -145,7 +145,7 @@ class ClassHint:
 
 
 def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
-    """Return the class hints of the configuration of `task` and of those that it extends, the nearest first."""
+    """Return the class hints in a chain of `extends`, beginning with the configuration of `task`."""
     return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
 
 

@@ -21,7 +21,7 @@ class FieldText:
     """Description of one field of a configuration."""
 
     path: str
-    """Dotted path, as on the command line; `<name>` stands for the entry of a map."""
+    """Dotted path, as on the command line; `<name>` stands for the name of an entry in a map."""
     kind: str
     """Accepted values, such as "a number" or "one of P, V, T"."""
     default: Any

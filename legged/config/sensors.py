@@ -8,7 +8,7 @@ from legged.config.bounds import between, rescaled
 @dataclass(frozen=True)
 class HeightMapConfig:
     """Errors of the map from which a robot reads the term `heights`, in addition to the term's noise, delay and lost packets.
-    They appear only in groups with `noise: true`.
+    They appear only in groups with `noise: true`. Half widths are those of uniform distributions around 0.
     """
 
     offset: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
@@ -29,7 +29,7 @@ class HeightMapConfig:
 
 @dataclass(frozen=True)
 class HeightLimitsConfig:
-    """Limits of the term `heights` for a trained policy; 0 for the limits of the training. Training does not use them."""
+    """Limits of the term `heights` in play, evaluation and export. A limit of 0 keeps the limit of the training."""
 
     heights_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
     """Limit that replaces observations.heights_limit [m]."""
