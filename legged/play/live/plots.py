@@ -25,7 +25,7 @@ DASH = (5, 2)
 MOST_POINTS = 160
 """Largest number of points of a curve; more could not be told apart in the panel."""
 LARGEST = 6
-"""Number of the largest reward terms, which have their own curves."""
+"""Number of reward terms that have their own curves. These are the largest terms."""
 LEFT, RIGHT, X_AXIS, FRAME = 44, 12, 30, 10
 """Width of the vertical axis, right margin, height of the time axis, and viser's margin around a chart [pixels]."""
 SMALLEST_RANGE = 0.25

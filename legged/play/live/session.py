@@ -39,7 +39,7 @@ SLOWEST, FASTEST = 0.1, 4.0
 HARDEST_PUSH = 3.0
 """Largest change of a robot's velocity by one push [m/s]."""
 BEHIND_S = 0.2
-"""Largest delay that the simulation makes up for. If it is longer, the machine is too slow or was busy [s]."""
+"""Largest delay that the simulation makes up for [s]. The rest of a longer delay is dropped."""
 PACE_S = 2.0
 """Real time over which the pace is measured [s]."""
 FREE_JOINT = 0
@@ -89,7 +89,7 @@ class Watched:
 
 
 def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
-    """Return the run that `name`, the argument POLICY, stands for, or the newest run without a name. The run need not have a
+    """Return the run that `name`, the argument POLICY, stands for; if `name` is None, the newest run. The run need not have a
     checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
 
     Raises:
