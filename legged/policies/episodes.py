@@ -32,7 +32,7 @@ def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, l
 
 
 def unit_of(task: BaseTask) -> float:
-    """Return the divisor that converts rewards to the task's unit, in which a step of a term counts scale * value."""
+    """Return the divisor that converts rewards to the task's unit: there, a term adds scale * value in each step."""
     return task.dt if task.cfg.rewards.times_dt else 1.0
 
 

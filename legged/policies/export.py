@@ -34,7 +34,7 @@ CHECKED_SEQUENCE = (100, 3)
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
 """Pairs of step and robot at which an episode begins during that check."""
 LARGEST_DIFFERENCE = 1e-4
-"""Largest allowed difference of an action from the policy's, relative to the largest action if that is above 1."""
+"""Largest allowed difference of an exported action from the policy's, relative to the largest action if that is above 1."""
 
 
 class ExportError(RunError):
@@ -180,7 +180,7 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
     inputs, outputs = module.input_names, module.output_names
     hidden = {name: {1: "batch"} for name in (*inputs[1:], *outputs[1:])}
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # from checks of shapes
+        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # caused by checks of shapes
         warnings.filterwarnings("ignore", message="Exporting a model to ONNX with a batch_size other than 1")
         torch.onnx.export(
             module,

@@ -38,13 +38,13 @@ TERMS = {
 }
 """Terms of which an observation may consist."""
 COMMANDS = ("command_xy", "command_yaw")
-"""Terms of a layout for the first two columns, and for the third column, of the term `commands` in policy.json."""
+"""Terms of a layout that split the term `commands` of policy.json: its first two columns, and its third column."""
 JOINTS, STIFFNESS, DAMPING = (
     ("dof_names", "joint_names"),
     ("kp", "stiffness", "joint_stiffness"),
     ("kd", "damping", "joint_damping"),
 )
-"""Keys, in an ONNX file's metadata, of the joints in the network's order, of P gains and of D gains; each has several."""
+"""Possible keys in an ONNX file's metadata: of the joints in the network's order, of P gains, and of D gains."""
 
 
 @dataclass(frozen=True)
