@@ -50,7 +50,7 @@ class Neighbours:
             self._lock = os.fdopen(descriptor, "wb")
             os.chmod(name, 0o644)
             lock_descriptor(descriptor, blocking=False)
-            self._path = Path(name).rename(f"{name}{ENDING}")  # others look for this ending, and now the file is locked
+            self._path = Path(name).rename(f"{name}{ENDING}")  # others look for this ending; the file is already locked
         self.look()
         return self
 
