@@ -26,8 +26,8 @@ from legged.process.command_parser import CommandParser, argument, check_between
 from legged.process.paths import ready_to_write
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
-"""Signals that end the program after the robot was braked: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and
-Ctrl-Z. By default most of them would leave the robot with its last command."""
+"""Signals at which the program brakes the robot and then ends: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\
+and Ctrl-Z. By default most of them would leave the robot with its last command."""
 SWITCH_S = 5e-4
 """Python's switch interval between threads [s]; the default of 5 ms is a quarter of a cycle."""
 EXIT_STOPPED = 3
@@ -156,7 +156,7 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 class Interruptible(Operator):
     """An operator that also ends the program at signals such as Ctrl-C (`ENDING`). A connected robot is braked first; without
-    one the program ends at once.
+    a robot the program ends at once.
     """
 
     def __init__(self, operator: Operator) -> None:

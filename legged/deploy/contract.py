@@ -359,7 +359,7 @@ def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Ter
     if scale.shape != (size,) or not np.isfinite(scale).all():
         raise ConfigError(f"{where}: scale of '{name}': must be {size} finite numbers, got {entry['scale']}")
     if source == "heights" and len(points) != size:
-        raise ConfigError(f"{where}: 'heights' has {size} numbers and {len(points)} points")
+        raise ConfigError(f"{where}: 'heights' has {size} numbers, but {len(points)} points")
     if scan not in SCANS:
         raise ConfigError(f"{where}: scan of '{name}': must be one of {', '.join(SCANS)}, got '{scan}'")
     return Term(

@@ -16,7 +16,7 @@ from legged.process.paths import make_folder, replacing
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Numbers of newest rows that are kept: 20 minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
+"""Largest numbers of rows; older rows are dropped. They last for 20 minutes at 250 readings and 50 cycles per second."""
 SHORTEST = 20
 """Smallest number of samples without a gap that is used for fitting."""
 UNEVEN = 0.75

@@ -194,7 +194,7 @@ class Script(Operator):
 
 
 class _Device(Operator):
-    """An operator with an open device, whose commands are shares of the largest command. A closed device counts as lost."""
+    """An operator with an open device. Commands are shares of the largest command. If the device is closed, it is lost."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         self._descriptor, self._name = descriptor, name

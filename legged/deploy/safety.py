@@ -11,7 +11,7 @@ from legged.deploy.policy import gravity_in
 SLOWEST_FALL = 0.5
 """Speed at which braking takes the whole torque of a joint, as a share of the joint's largest speed."""
 AT_ONCE = 2.0
-"""Factor on the allowed joint speed above which the robot is stopped at once."""
+"""Multiple of the allowed joint speed above which the robot is stopped at once."""
 MOST_DAMPING = 4.0
 """Largest D gain for braking, as a multiple of the policy's D gain, because motors may be unstable far above that gain."""
 
