@@ -70,7 +70,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         if config is not None and not (isinstance(config, Mapping) and all(isinstance(path, str) for path in config)):
             raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
         if "env.num_envs" in (config or {}):
-            raise ConfigError("config: env.num_envs: the number of environments is that of make_vec(..., num_envs=...)")
+            raise ConfigError("config: env.num_envs: the argument num_envs of make_vec sets the number of environments")
         self.num_envs, self._to_numpy = num_envs, to_numpy
         self.render_mode, self._size = render_mode, (int(width), int(height))
         self._device = pick_device(str(device), "device")

@@ -221,15 +221,15 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
                     parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
                     example = next((unit for unit in parents if unit is not None), "m^2/s^2")
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, and"
+                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, but"
                         f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit for that: write @unit("{example}") above the method (from legged import'
-                        ' unit), with the unit of what it returns; a plain number has @unit("1"). A docstring does not count'
+                        f' declares no unit. Write @unit("{example}") above the method (from legged import unit), with the'
+                        ' unit of its return value; a plain number has @unit("1"). A docstring does not count'
                     )
 
 
 def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
-    """Return the function that rescales the numbers of a configuration from its reference robot to another one."""
+    """Return the function that rescales a configuration from its reference robot to another robot."""
 
     def unit_at(name: str) -> str:
         section, _, entry = name.rpartition(".")
