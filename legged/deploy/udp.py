@@ -1,4 +1,4 @@
-"""A robot that is reached by UDP, and its packets. It is a simulator in another process, or a bridge to a real robot.
+"""A robot that is reached by UDP, and its packets. The robot is a simulator in another process, or a bridge to a real robot.
 
 A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program begins the handshake
 with HELLO and the sources that it needs, and the robot answers with FACTS, both as JSON. Then the robot sends states to the

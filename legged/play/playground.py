@@ -112,7 +112,7 @@ class Playground:
         return label(self.rows[row][column].type, [self.rows[row][column].size])
 
     def labels(self) -> dict[str, str]:
-        """Return terrain type -> the text of `label` with the sizes of its tiles."""
+        """Return terrain type -> text of the function `label`, with the sizes of all tiles of the type."""
         sizes: dict[str, dict[float, None]] = {}  # an ordered set of sizes for each type
         for spec in (*self.rows[0], *self.rows[1]):
             sizes.setdefault(spec.type, {})[spec.size] = None
