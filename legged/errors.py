@@ -14,8 +14,8 @@ def one_line(text: str) -> str:
 
 
 class ConfigError(ValueError):
-    """Wrong input by the user. The text names the place, the given value and the allowed values. A command ends with code
-    2.
+    """Wrong input by the user. The text names the place, the given value and the allowed values. A command then ends with
+    exit code 2.
     """
 
     def __init__(self, text: str) -> None:
@@ -24,7 +24,7 @@ class ConfigError(ValueError):
 
 class RunError(RuntimeError):
     """Failure of a command for a reason outside its input: a full disk, a closed output, numbers that stay non-finite. The
-    command ends with code 1.
+    command ends with exit code 1.
     """
 
     def __init__(self, text: str) -> None:

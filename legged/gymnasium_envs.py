@@ -34,7 +34,7 @@ LARGEST_PICTURE = 16384
 class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
     """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
     first observation of the next episode, and `infos["final_obs"]` has the last observation of the old episode. The
-    environments have their own random numbers, because tasks draw from torch's global generators.
+    environments have their own random state, which they put into torch's global generators during a call.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -70,7 +70,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         if config is not None and not (isinstance(config, Mapping) and all(isinstance(path, str) for path in config)):
             raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
         if "env.num_envs" in (config or {}):
-            raise ConfigError("config: env.num_envs: the number of environments is that of make_vec(..., num_envs=...)")
+            raise ConfigError("config: env.num_envs: the argument num_envs of make_vec sets the number of environments")
         self.num_envs, self._to_numpy = num_envs, to_numpy
         self.render_mode, self._size = render_mode, (int(width), int(height))
         self._device = pick_device(str(device), "device")
@@ -82,9 +82,9 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         with self._own_random_numbers():
             self.task: Any = make_task(cfg, self._device, graph=False)
             """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
-            # On a GPU the captured step includes the copies of final states. On the CPU it need not be checked for capture.
+            # On a GPU the step is captured anew, with the copies of final states. On the CPU there is no capture to check.
             self.final = keep_final_step(self.task, graph=self._device.type == "cuda")
-            # One step is made and undone, because terms create buffers at their first call, which the initial state includes.
+            # Terms create buffers at their first call, and the initial state includes them. So one step is made and undone.
             before = self.task.state_dict()
             self.task.step(torch.zeros_like(self.task.actions))
             self._beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
@@ -123,7 +123,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode in every environment; return the observations (N, width) and empty infos. A seed restores the
-        initial state, curricula included, and seeds the random numbers. Without a seed the random numbers continue.
+        initial state, curricula included, and seeds the random numbers. Without a seed the random numbers go on.
 
         Raises:
             ConfigError: `options` are given.
@@ -148,8 +148,8 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         that ended in a failure and of those whose time ran out, and infos.
 
         Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
-        the last observations in `final_obs`. With NumPy, `final_obs` is an array of N objects, None for environments whose
-        episode goes on. It is absent if no episode ended. With tensors it is (N, width), and valid where the mask
+        the last observations in `final_obs`. With NumPy, `final_obs` is an array of N objects, None where the episode
+        goes on; the key is absent if no episode ended. With tensors, `final_obs` is (N, width), and valid where the mask
         `_final_obs` is true.
 
         Raises:
@@ -160,7 +160,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         seen, rewards = self._seen(observations), self._given(rewards)
         terminated, truncated = (self._given(mask.clone()) for mask in (self.task.terminated_buf, self.task.time_out_buf))
         ended = terminated | truncated
-        terms = self._given(self.task.rewards.last.clone())  # all in one copy
+        terms = self._given(self.task.rewards.last.clone())  # one copy to the host for all terms
         parts = {f"{REWARD}{name}": part for name, part in zip(self.task.rewards.names, terms, strict=True)}
         infos = masked(parts, ~ended)
         if not self._to_numpy or ended.any():
@@ -225,7 +225,7 @@ class TaskEnv(gymnasium.Env):  # type: ignore[misc]
             ConfigError: `options` are given.
         """
         super().reset(seed=seed)
-        self._vector.np_random = self.np_random  # for the first seed
+        self._vector.np_random = self.np_random  # the first seed comes from here
         seen, infos = self._vector.reset(seed=seed, options=options)
         self._over = self._shows_the_next = False
         return row(seen, 0), infos
@@ -271,7 +271,7 @@ def row(value: Any, index: int) -> Any:
 
 
 def rows_of(value: Any, mask: np.ndarray) -> np.ndarray:
-    """Return an array (N,) of objects, as Gymnasium stores final observations: copies of the rows in `mask` (N,) or None."""
+    """Return an array (N,) of objects, as in Gymnasium: copies of the rows where `mask` (N,) is True, elsewhere None."""
     found = np.full(len(mask), None, dtype=object)
     for index in mask.nonzero()[0].tolist():
         found[index] = deepcopy(row(value, index))

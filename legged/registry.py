@@ -50,7 +50,7 @@ CLASSES = {
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """Task class; None for the class that the configuration names, or else for that of the task that it extends."""
+    """Task class; None if the configuration names it, or takes it from the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
@@ -84,7 +84,7 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 def import_tasks(name: str) -> None:
     """Register user-defined tasks: run the module with that name or path, or register the YAML file at that path. `name` may
-    hold several, separated by commas, such as the module of a class and a YAML file that uses it.
+    hold several, separated by commas, such as the module of a class and a YAML file that uses the class.
 
     Raises:
         ConfigError: a module or a file can't be found, or fails.
@@ -221,15 +221,15 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
                     parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
                     example = next((unit for unit in parents if unit is not None), "m^2/s^2")
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, and"
+                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, but"
                         f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit for that: write @unit("{example}") above the method (from legged import'
-                        ' unit), with the unit of what it returns; a plain number has @unit("1"). A docstring does not count'
+                        f' declares no unit. Write @unit("{example}") above the method (from legged import unit), with the'
+                        ' unit of its return value; a plain number has @unit("1"). A docstring does not count'
                     )
 
 
 def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
-    """Return the function that rescales the numbers of a configuration from its reference robot to another one."""
+    """Return the function that rescales a configuration from its reference robot to another robot."""
 
     def unit_at(name: str) -> str:
         section, _, entry = name.rpartition(".")

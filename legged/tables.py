@@ -16,8 +16,8 @@ def markdown_table(heads: Sequence[object], rows: Sequence[Sequence[object]], le
 def screen_table(
     title: str, heads: Sequence[str], rows: Sequence[Sequence[str] | None], left: Collection[int] = (0,)
 ) -> Table:
-    """Return a table for the screen. Columns in `left` hold texts, all others hold numbers. A row that is None draws a rule;
-    a short row leaves its last cells empty.
+    """Return a table for the screen. Columns in `left` hold texts, all others hold numbers. None in place of a row draws a
+    line; a short row leaves its last cells empty.
     """
     table = Table(title=escape(title), title_justify="left")
     for i, head in enumerate(heads):

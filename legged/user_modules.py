@@ -13,12 +13,12 @@ from legged.process.paths import exists
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""
 _FOLDERS: set[str] = set()
-"""Folders in which such modules were found."""
+"""Folders of all modules that were run, from files or by name."""
 
 
 def run_module(name: str) -> None:
-    """Import a user-defined module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. It can import other
-    modules of its folder.
+    """Import a user-defined module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. The module can import
+    others in its folder.
 
     Raises:
         ConfigError: the module can't be found, or fails.
@@ -50,7 +50,7 @@ def find_modules_in(folder: str) -> None:
 
 
 def is_of_a_module(file: str) -> bool:
-    """Return True if a file of code lies in or below the folder of a module that was run."""
+    """Return True if a code file lies in or below the folder of a module that was run, outside site-packages."""
     path = Path(file)
     return any(path.is_relative_to(folder) for folder in _FOLDERS) and "site-packages" not in path.parts
 

@@ -1,4 +1,4 @@
-"""Settings of real motors: torque limits that depend on speed, friction, delay, and learned actuators."""
+"""Settings of real motors: speed-dependent torque limits, friction, delay, and learned actuators."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -8,15 +8,15 @@ from legged.config.bounds import LARGEST, TERMS, between, positive, quantity
 MOTORS = "motors.npz"
 """File name of the copy of a learned actuator (`network`) in a run folder and in an export."""
 LONGEST_DELAY = 1000
-"""Largest delay, in steps."""
+"""Largest delay in a configuration, in physics steps of a motor or control steps of an observation."""
 Steps = tuple[int, int]
 """Smallest and largest number of steps."""
 
 
 @dataclass(frozen=True)
 class ActuatorConfig:
-    """Motor model between a target and the joint torque. By default motors are ideal: they give the torque of the control law
-    at once, up to their effort limit.
+    """Model of the motors, which turn targets into joint torques. By default motors are ideal: they give the torque of the
+    control law at once, up to their effort limit.
     """
 
     model: Literal["ideal", "dc_motor"] = "ideal"
@@ -44,9 +44,9 @@ class ActuatorConfig:
     friction_smoothing: float = field(default=0.1, metadata=quantity("rad/s", positive(1000, low=1e-4)))
     """Speed v0 below which Coulomb friction fades, as tanh(v / v0) [rad/s]."""
     delay: Steps = field(default=(0, 0), metadata=between(0, LONGEST_DELAY))
-    """Range of the delay of a robot's targets, in physics steps (sim.dt). The delay is drawn at the start of an episode."""
+    """Range of the delay of a robot's targets, in physics steps (sim.dt). Each robot's delay is sampled for each episode."""
     delay_varies: bool = False
-    """Draw each robot's delay in every control step. An older target never replaces a newer one."""
+    """Sample a new delay for each robot in every control step. An older target never replaces a newer one."""
     network: str = ""
-    """File of a learned actuator (`legged fit-actuator`), relative to the file that names it. It computes the torque from
-    target, angle and velocity, in place of the P law."""
+    """File of a learned actuator (`legged fit-actuator`), relative to the configuration file. The network in this file
+    computes the torque from target, angle and velocity, in place of the P law."""

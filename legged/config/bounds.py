@@ -13,7 +13,7 @@ FLOAT32_MAX = 3.4e38
 SMALLEST = 1e-9
 """Smallest value of a positive quantity, because many are divisors."""
 LONGEST_S = 1e9
-"""Longest time [s], long enough for an event that should never happen."""
+"""Longest time [s]. An event with this interval never happens in practice."""
 LARGEST = 1e6
 """Largest scale, gain or limit. Its square still fits float32."""
 
@@ -39,19 +39,19 @@ def quantity(unit: str, bounds: Bounds) -> Bounds:
 
 
 def rescaled(unit: str, bounds: Bounds) -> Bounds:
-    """Return metadata of a quantity of `unit` that is rescaled for another robot (rescale.py), within `bounds`."""
+    """Return metadata of a quantity of `unit`, within `bounds`, that is rescaled for another robot (rescale.py)."""
     return {**quantity(unit, bounds), "rescaled": unit}
 
 
 def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
-    """Return metadata of a map term -> number. When they are rescaled, the numbers have the unit of the method
+    """Return metadata of a map: term -> number. Numbers are rescaled for another robot. A number has the unit of the method
     `<prefix><term>`, raised to `power`.
     """
     return {**bounds, "unit_of": (prefix, power)}
 
 
 def rescaled_by_entry(path: str, bounds: Bounds) -> Bounds:
-    """Return metadata of the map at the dotted `path`. The numbers of each entry are rescaled by the entry's unit."""
+    """Return metadata of the map at the dotted `path`. Each entry has its own unit, and is rescaled for another robot."""
     return {**bounds, "unit_of": (f"{path}.", 1)}
 
 
@@ -59,7 +59,7 @@ UNIT = between(0, 1)
 NAME: Bounds = {"name": True}
 """Name of a folder; it may be empty."""
 NAMES = items(1000)
-"""List of different texts."""
+"""List of texts without duplicates. It must not be empty."""
 NAMES["unique"] = True
 TERMS: Bounds = {**NAMES, "may_be_empty": True}
-"""List of different texts, which may be empty."""
+"""List of texts without duplicates. It may be empty."""

@@ -1,5 +1,5 @@
-"""Conversion of plain values to an instance of a schema, field by field. Every error names the source of the value and its
-path.
+"""Conversion of plain values to an instance of a schema, field by field. Every error names the source of the value, such as a
+file, and its dotted path.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ PLAIN = "a plain name: no path separators, not '..', no leading '.', no control 
 
 @functools.cache
 def hints_of(schema: type) -> dict[str, Any]:
-    """Return field -> type of a dataclass."""
+    """Return the types of a dataclass's fields: name -> type."""
     return typing.get_type_hints(schema)
 
 
@@ -42,7 +42,7 @@ def shown(value: Any) -> str:
 
 
 def plain_path(key: Any) -> str:
-    """Return a key as part of a dotted path in an error, on one line and cut if it is long."""
+    """Return a key as part of a dotted path in an error. A long or unprintable key is cut or escaped."""
     return key if isinstance(key, str) and key and key.isprintable() and len(key) <= SHOWN else shown(key)
 
 
@@ -54,8 +54,8 @@ def is_plain_name(name: str) -> bool:
 
 
 def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, base: T | None = None) -> T:
-    """Build an instance of the dataclass `schema` from a mapping, with every field checked. Missing fields come from `base`,
-    or else from the schema's defaults.
+    """Build an instance of the dataclass `schema` from the mapping `data`, and check every field. A field that is missing in
+    `data` keeps its value in `base` or, without `base`, its default.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
@@ -91,7 +91,7 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, 
 def _build_entries(
     schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the sections in a map. If a section lacks a field, the default entry with the section's name gives it."""
+    """Build the sections in a map. A field that a section lacks keeps its value in the section of that name in `entries`."""
     names = _check(dict[str, object], data, path, origins, source)  # `build` checks the values
     return {
         name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
@@ -99,7 +99,7 @@ def _build_entries(
 
 
 def _origin(path: str, origins: Origins, source: str) -> str:
-    """Return the source of the value at `path`, or `source` if it is not recorded."""
+    """Return the recorded source of the value at `path`, else `source`."""
     return origins.of(path) if path and origins else source
 
 
@@ -114,20 +114,19 @@ WORDS = {
 
 
 def _shape(kind: Any) -> Any:
-    """Return the kind of value that a type accepts, a key of WORDS: a number, a name, a list, a map, or a section."""
+    """Return the key of WORDS that describes the values of a type."""
     origin = typing.get_origin(kind)
     return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (Literal, tuple, dict) else float
 
 
 def _has_shape(kind: Any, value: Any) -> bool:
-    """Return True if a value is of the kind that a type accepts."""
     looks_like: dict[Any, Any] = {float: (int, float), Literal: str, tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
     return isinstance(value, looks_like[_shape(kind)])
 
 
 def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
-    """Return `value` as `kind`, or raise ConfigError. Integers become floats and lists become tuples; nothing else is
-    converted.
+    """Return `value` as the type `kind`, or raise ConfigError. Integers become floats where `kind` is float, lists become
+    tuples, and nothing else is converted.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
 
@@ -187,7 +186,7 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
 
 
 def _number(value: float, fail: Any) -> float:
-    """Return a number that fits float32."""
+    """Return a number as a finite float."""
     if value != value:
         raise fail("a number")
     try:
@@ -200,8 +199,8 @@ def _number(value: float, fail: Any) -> float:
 
 
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
-    """Check a value in the free part of a configuration: anything that YAML can write and read, except NaN and infinite
-    numbers.
+    """Return a copy of a value in the free part of a configuration. It may be anything that YAML can write and read, except
+    NaN and infinite numbers.
     """
     if depth > DEEPEST:
         raise fail(f"at most {DEEPEST} nested maps and lists")
@@ -215,7 +214,7 @@ def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         if value != value or not abs(value) <= FLOAT32_MAX:
             raise fail(f"finite numbers, at most {FLOAT32_MAX:g} in size")
-        return int(value) if isinstance(value, int) else float(value)  # a NumPy number would not be written as YAML
+        return int(value) if isinstance(value, int) else float(value)  # YAML has no NumPy numbers
     elif value is not None and not isinstance(value, bool | str):
         raise fail("numbers, texts, true, false, null, lists and maps of them")
     return value

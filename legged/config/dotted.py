@@ -30,8 +30,8 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return dotted path -> its value in each configuration, for all settings that differ. If a configuration lacks the
-    setting, the value is MISSING. An empty mapping counts only if it is empty or missing in every configuration.
+    """Return the settings that differ: dotted path -> value in each configuration, MISSING where a configuration lacks it. If
+    a mapping is empty in one configuration and has settings in another, only these settings are compared.
     """
     all_flat = [flat(config) for config in configs]
     paths = dict.fromkeys(path for one in all_flat for path in one)

@@ -74,15 +74,15 @@ class AlgorithmConfig:
     value_loss_coef: float = field(default=1.0, metadata=between(0, 1000))
     """Weight of the value function's error in the loss."""
     use_clipped_value_loss: bool = True
-    """Clip the change of the value function by clip_param, like that of the policy."""
+    """Limit the change of the value function by clip_param, like the change of the policy."""
     clip_param: float = field(default=0.2, metadata=positive(100, low=1e-6))
-    """Largest distance from 1 of the ratio of new to old probability; beyond it the ratio is clipped."""
+    """The ratio of an action's new to its old probability is clipped between 1 - clip_param and 1 + clip_param."""
     entropy_coef: float = field(default=0.01, metadata=between(0, 100))
     """Weight of the entropy in the loss. A larger weight keeps up exploration."""
     num_learning_epochs: int = field(default=5, metadata=between(1, 1000))
-    """Passes over the samples of an iteration."""
+    """Number of passes over the samples of an iteration."""
     num_mini_batches: int = field(default=4, metadata=between(1, 1_000_000))
-    """Number of mini-batches in an iteration. Each gives one gradient step."""
+    """Number of mini-batches in a pass over the samples. Each mini-batch gives one gradient step."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
     """Optimiser, by torch's names."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
@@ -107,18 +107,18 @@ class AlgorithmConfig:
     symmetry: bool = False
     """Learn from every sample and its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
     mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
-    """Weight of the mirror loss, with symmetry: the difference between the actions for a mirrored observation and the
-    mirrored actions; 0 for none."""
+    """Weight of the mirror loss, which needs `symmetry`; 0 switches it off. The loss is the squared difference between the
+    actions for a mirrored observation and the mirrored actions."""
     critic_warmup_iterations: int = field(default=0, metadata=between(0, 1_000_000_000))
     """Number of iterations at the start in which the value function learns alone. The policy, its standard deviation and its
-    normaliser stay constant. `--transfer` then takes the policy alone, with a new value function, optimiser and standard
-    deviation."""
+    normaliser stay constant. With this setting, `--transfer` loads only the policy, and starts with a new value function,
+    optimiser and standard deviation."""
 
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Distillation, by rsl-rl's names: a student acts, and learns the actions that its teacher would have taken (Ross et al.,
-    arXiv 1011.0686).
+    """Settings of distillation, by rsl-rl's names. A student acts, and learns the actions that its teacher would have taken
+    (Ross et al., arXiv 1011.0686).
     """
 
     teacher: str = ""
@@ -128,10 +128,10 @@ class DistillationConfig:
     """Loss of the difference between the mean actions of student and teacher: squared (`mse`), or squared up to 1 and linear
     beyond (`huber`)."""
     gradient_length: int = field(default=8, metadata=between(1, 100_000))
-    """Control steps of all robots per gradient step. The gradient of a recurrent student goes back through as many steps.
-    Must divide train.runner.num_steps_per_env."""
+    """Number of control steps, of all robots, that each gradient step uses. In a recurrent student the gradient flows back
+    through all of them. Must divide train.runner.num_steps_per_env."""
     num_learning_epochs: int = field(default=2, metadata=between(1, 1000))
-    """Passes over the steps of an iteration."""
+    """Number of passes over the steps of an iteration."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
     """Learning rate."""
     max_grad_norm: float = field(default=1.0, metadata=positive(1e9))
@@ -140,7 +140,7 @@ class DistillationConfig:
 
 @dataclass(frozen=True)
 class RunnerConfig:
-    """Length of training, evaluations, and files to write."""
+    """Settings of the length of training, of evaluations during training, and of the files that it writes."""
 
     num_steps_per_env: int = field(default=24, metadata=between(1, 100_000))
     """Control steps of each robot per iteration."""
@@ -149,8 +149,8 @@ class RunnerConfig:
     save_interval: int = field(default=50, metadata=between(1, 1_000_000_000))
     """Iterations between two checkpoints."""
     evaluate_interval: int = field(default=0, metadata=between(0, 1_000_000_000))
-    """Iterations between two evaluations during training; 0 for none. They measure the policy without exploration, on
-    separate robots without disturbances."""
+    """Iterations between two evaluations during training; 0 for no evaluations. An evaluation measures the policy without
+    exploration, on separate robots without disturbances."""
     evaluate_share: float = field(default=0.03, metadata=UNIT)
     """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed this
     share is skipped, except the first and the last; 1 skips none."""
@@ -158,19 +158,19 @@ class RunnerConfig:
     """Largest number of robots of an evaluation during training. The commands of the task's grid are distributed over
     them."""
     evaluate_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
-    """Simulated time of an evaluation during training [s]; 0 for 3 s, or a whole episode in tasks without commands."""
+    """Simulated time of an evaluation during training [s]. 0 means 3 s or, in tasks without commands, a whole episode."""
     best_by: str = ""
     """Figure of the evaluations during training that selects model_best.pt; empty for lin_vel_rmse, or for the return in
     tasks without commands."""
     stop_at: dict[str, float] = field(default_factory=dict, metadata=between(-1e12, 1e12))
-    """Figure of the evaluations during training -> its target. Training ends when all targets are reached. Falls and figures
-    ending in _rmse must be at most their target, others at least."""
+    """Figure of the evaluations during training -> its target. Training ends when all targets are reached. `falls` and
+    figures ending in _rmse must be at most their target; all others must be at least their target."""
     loop: Literal["stock", "captured"] = "captured"
-    """Training loop. `captured`: rsl-rl's arithmetic without the host, as CUDA graphs on a GPU; if networks or algorithm need
-    it, `stock` runs instead, with a message. `stock`: rsl-rl's own training loop."""
+    """Training loop. `stock`: rsl-rl's own loop. `captured`: the same arithmetic, on a GPU as CUDA graphs. If the networks or
+    the algorithm cannot be captured, a message says so, and `stock` runs."""
     matmul: Literal["float32", "tf32"] = "tf32"
-    """Precision of matrix products during training. On a GPU `tf32` keeps 10 of the factors' 23 bits, which is faster. On a
-    CPU it selects the fastest library that keeps all bits."""
+    """Precision of matrix products during training. On a GPU `tf32` is faster, but keeps only 10 of the 23 mantissa bits of
+    the factors. On a CPU it keeps all bits and selects the fastest library."""
     experiment_name: str = field(default="", metadata=NAME)
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)
@@ -178,11 +178,11 @@ class RunnerConfig:
     report: bool = True
     """Write report.html and report.md into the run folder at the end of a training."""
     film: bool = True
-    """Record a film of the last policy for the report, which takes about ten seconds. Only for a complete training, on a
-    machine that can render."""
+    """Record a film of the final policy for the report, which takes about ten seconds. There is no film if the training was
+    stopped early, or if the machine cannot render."""
     logger: str = "tensorboard"
-    """Tracker in addition to TensorBoard: `tensorboard` for none, `wandb`, `neptune`, or module:Class of a writer that
-    extends rsl-rl's LogWriter."""
+    """Tracker in addition to TensorBoard: `wandb`, `neptune`, or module:Class of a writer that extends rsl-rl's LogWriter;
+    `tensorboard` for no other tracker."""
     logger_project: str = field(default="", metadata=NAME)
     """Project name for the tracker; the folder under logs/ when empty."""
 

@@ -1,6 +1,6 @@
 """Configuration of a legged robot that follows velocity commands. It extends the sections of every task.
 
-Defaults are legged_gym's (v1.0.2, arXiv 2109.11978) for the fields that it has.
+Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same defaults.
 """
 
 from dataclasses import dataclass, field, replace
@@ -34,10 +34,10 @@ from legged.config.sensors import HeightLimitsConfig, HeightMapConfig
 from legged.config.task import TaskConfig
 
 MOTION = between(-100, 100)
-"""Bounds of velocities [m/s] or [rad/s], of angles [rad], and of factors on them."""
+"""Bounds of velocities [m/s] or [rad/s], of angles [rad], and of factors on angles."""
 MEASURED = rescaled("m", items(500, between(-100, 100)))
 FASTEST = 20.0
-"""Largest command of an evaluation [m/s, rad/s]. The ground that robots need grows with its square."""
+"""Largest command of an evaluation [m/s, rad/s]. The area that robots need grows with the square of the command."""
 Axis = tuple[float, float, float]
 """Lowest value, highest value, and step."""
 AXIS = between(-FASTEST, FASTEST)
@@ -59,8 +59,8 @@ class TerrainConfig:
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; the shares sum to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
     sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes", positive(100)))
-    """Terrain type -> size of all its tiles in the type's unit, or [low, high]. With two sizes, they change evenly from the
-    easier one in the first row to the harder one at difficulty 1. An entry replaces the type's default sizes."""
+    """Terrain type -> size of all its tiles, or range [low, high], in the type's unit. Sizes in a range change evenly from
+    the easier end in the first row to the harder end at difficulty 1. An entry replaces the type's default sizes."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
     """Number of rows. The difficulty of a row is row / num_rows."""
     num_cols: int = field(default=20, metadata=between(1, 1000))
@@ -97,21 +97,21 @@ class CommandRanges:
     lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Leftward velocity in the base frame [m/s]."""
     ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=quantity("rad/s", MOTION))
-    """Yaw rate [rad/s]. In heading mode it limits the heading controller, and a curriculum widens it too."""
+    """Yaw rate [rad/s]. In heading mode this range limits the heading controller; a curriculum widens the range too."""
     heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=quantity("rad", MOTION))
     """Heading in the world, in heading mode only [rad]."""
 
 
 @dataclass(frozen=True)
 class CommandCurriculumConfig:
-    """Curriculum of the commands, which widens each axis while robots follow it well."""
+    """Curriculum that widens the range of each command axis while robots follow that axis well."""
 
     enabled: bool = False
     """Start from the share `start` of the full ranges and widen them; otherwise use the full ranges from the first step."""
     start: float = field(default=0.3, metadata=UNIT)
     """Initial share of the full range on each axis."""
     step: float = field(default=0.1, metadata=positive(1, low=1e-6))
-    """Share of the full range by which an axis is widened."""
+    """Share of the full range by which an axis is widened each time."""
     window_s: float = field(default=1.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time over which velocities are averaged to decide about an axis [s]."""
     threshold: float = field(default=0.75, metadata=UNIT)
@@ -131,7 +131,7 @@ class CommandsConfig:
     small_command: float = field(default=0.2, metadata=quantity("m/s", between(0, 100)))
     """Norm below which a sampled horizontal velocity is set to zero [m/s]."""
     standing_share: float = field(default=0.0, metadata=UNIT)
-    """Share of sampled commands to stand still."""
+    """Share of the sampled commands that are zero, so that the robot stands still."""
     single_axis_share: float = field(default=0.0, metadata=UNIT)
     """Share of sampled commands on a single random axis: walking straight, sideways, or turning on the spot."""
     curriculum: CommandCurriculumConfig = CommandCurriculumConfig()
@@ -162,16 +162,16 @@ class LeggedControlConfig(ControlConfig):
     damping: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
     """Joint-name pattern -> D gain [N m s/rad]; empty for the robot's gains."""
     action_scale: float | dict[str, float] = field(default=0.5, metadata=quantity("rad", positive(LARGEST)))
-    """Scale of the actions; target = action_scale * action + default angle (P) [rad]. For other laws the unit is that of
-    their target [rad/s, N m]. One number, or joint-name pattern -> number."""
+    """Scale of the actions: one number, or joint-name pattern -> number. Law P: target = action_scale * action + default
+    angle [rad]. Laws V and T: target = action_scale * action [rad/s] or [N m]."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Patterns of joints without an action (P). Their motors hold the default angle with their own gains."""
+    """Patterns of joints that have no action. They need law P, which holds them at the default angle with their own gains."""
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
     """Properties of motors that are not ideal: torque limits over speed, friction, delay, learned actuators."""
 
     @property
     def laws(self) -> set[str]:
-        """The laws that joints have."""
+        """All control laws that `control_type` names."""
         return {self.control_type} if isinstance(self.control_type, str) else set(self.control_type.values())
 
 
@@ -180,8 +180,8 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """Terms that end an episode."""
 
     failures: tuple[str, ...] = field(default=("contact", "base_height", "tilt"), metadata=TERMS)
-    """Terms that count as failures. `contact`: one of the robot's `terminate_after_contacts_on` shapes feels more than 1 N,
-    or 1 % of a weight below 100 N. `base_height` and `tilt`: the limits below."""
+    """Terms that count as failures. `contact`: the contact force on a `terminate_after_contacts_on` shape exceeds 1 N, or for
+    robots lighter than 100 N, 1 % of the weight. `base_height` and `tilt`: limits min_base_height and max_tilt."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
     """Terms that count as time-outs. `left_terrain`: the robot left the map, which does not count as a failure."""
     min_base_height: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
@@ -197,8 +197,8 @@ class LeggedDomainRandConfig(DomainRandConfig):
     randomize_friction: bool = True
     """Randomise the friction of each robot's contacts."""
     friction_range: Range = field(default=(0.5, 1.25), metadata=between(0, 100))
-    """Range of the contacts' Coulomb friction. PhysX averages foot and ground. MuJoCo takes the foot's friction, because the
-    foot has priority."""
+    """Range of the feet's Coulomb friction. In MuJoCo it is also that of the contacts, because a foot has priority over the
+    ground. PhysX takes the average of foot and ground."""
     friction_buckets: int = field(default=64, metadata=between(1, 1_000_000))
     """Number of different friction values."""
     randomize_base_mass: bool = False
@@ -206,7 +206,7 @@ class LeggedDomainRandConfig(DomainRandConfig):
     added_mass_range: Range = field(default=(-5.0, 5.0), metadata=rescaled("kg", between(-10_000, 10_000)))
     """Range of the mass added to the base [kg]."""
     push_robots: bool = True
-    """Set the base's horizontal velocity at random times, separately for each robot."""
+    """Give each robot's base a random horizontal velocity at intervals. Robots are pushed at different times."""
     push_interval_s: float = field(default=15.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time between two pushes of a robot [s]."""
     max_push_vel_xy: float = field(default=1.0, metadata=rescaled("m/s", between(0, 100)))
@@ -222,7 +222,7 @@ class LeggedDomainRandConfig(DomainRandConfig):
 
     def nominal(self) -> Self:
         plain = super().nominal()
-        by_flag: dict[str, Range | DrawConfig] = {}  # evaluation switches these two off by flags
+        by_flag: dict[str, Range | DrawConfig] = {}  # these two have flags, which play and evaluation clear
         if self.randomize_friction:
             by_flag["friction"] = self.friction_range
         if self.randomize_base_mass:
@@ -259,9 +259,9 @@ class LeggedRewardsConfig(RewardsConfig):
     """Target of the swing time [s]. feet_air_time rewards longer swings and punishes shorter ones; single_stance is largest
     at this time."""
     feet_clearance_target: float = field(default=0.1, metadata=rescaled("m", between(0, 100)))
-    """Height of a swinging foot above the lowest foot that feet_clearance rewards [m]."""
+    """Target of feet_clearance: height of a swinging foot above the lowest foot [m]."""
     base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))
-    """Base height that base_height rewards [m]."""
+    """Target of base_height: height of the base above the ground [m]."""
     max_contact_force: float = field(default=500.0, metadata=rescaled("N", positive(LARGEST)))
     """Foot force above which feet_contact_forces punishes [N]."""
     soft_dof_pos_limit: float = field(default=1.0, metadata=positive(10))
@@ -308,9 +308,9 @@ class LeggedObservationsConfig(ObservationsConfig):
     heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))
     """Largest absolute value of an observed height [m]."""
     depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
-    """Largest depth of low ground in observed heights, if it is below heights_limit [m]; 0 for heights_limit alone."""
+    """Largest observed depth of low ground [m]. It has an effect only below heights_limit; 0 switches it off."""
     once_trained: HeightLimitsConfig = field(default_factory=HeightLimitsConfig)
-    """Limits of observed heights in play, evaluation and export, if they are below those of the training."""
+    """Limits of observed heights in play, evaluation and export, where they differ from those of the training."""
     height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
     """Errors of the height map, in addition to the noise of its points."""
 
@@ -344,7 +344,7 @@ class LeggedConfig(TaskConfig):
     """Configuration of a legged robot that follows velocity commands."""
 
     robot: str = ""
-    """Robot: a folder under resources/robots/, or a path to a folder, relative to the file that names it."""
+    """Robot: a folder under resources/robots/, or the path of a folder, relative to the configuration file."""
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     """Terrain under the robots."""
     commands: CommandsConfig = field(default_factory=CommandsConfig)

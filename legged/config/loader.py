@@ -33,8 +33,8 @@ class Registered:
 
 Source = Path | Mapping[str, Any] | Registered
 Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
-"""Function: (data of a layer, the layer's reference robot, the task's robot, beginning of errors) -> data for the task's
-robot."""
+"""Function: (settings, the robot for which they were written, the task's robot, beginning of errors) -> settings for the
+task's robot."""
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
@@ -72,7 +72,7 @@ class _Layer:
     kind: Any
     """Value of `class:`, or None."""
     reference_robot: Any
-    """Robot for which the numbers are written, or None for any robot."""
+    """Robot for which the numbers were written; None if they suit any robot."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
@@ -115,8 +115,8 @@ def _mark(source: Source) -> Any:
 def _parent(
     parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
 ) -> tuple[Path | Registered, str]:
-    """Return the configuration that `extends: parent` means, and its name: a file in the folder `beside`, a registered task,
-    or a task of this package.
+    """Return the configuration that `extends: parent` names, and its name. The configuration is that of a file in the
+    folder `beside`, else of a registered task, else of a task of this package.
     """
     if not isinstance(parent, str) or not parent:
         raise ConfigError(f"{name}: extends: expected the name of a task or of a file next to this one, got {shown(parent)}")
@@ -134,26 +134,26 @@ def _parent(
 
 @dataclass(frozen=True)
 class ClassHint:
-    """Class of the task according to one configuration of a chain."""
+    """Class of the task according to one configuration in a chain of `extends`."""
 
     where: str
     """Beginning of errors about this hint."""
     task: str | None
-    """Name of the registered task, which may have a class; None for a file."""
+    """Name of the registered task, which may have been registered with a class; None for a file."""
     kind: Any
     """Value of `class:`, or None."""
 
 
 def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
-    """Return the class hints of the configuration of `task` and of those that it extends, the nearest first."""
+    """Return the class hints in a chain of `extends`, beginning with the configuration of `task`."""
     return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
 
 
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Merge layers. A value in a file replaces the values in the files that it extends. On a CPU, the `cpu:` section of each
-    layer is merged on top of it.
+    """Merge layers. The values of a configuration replace those of the configurations that it extends. With `on_cpu`, the
+    `cpu:` section of each layer is merged on top of the layer.
 
     Each layer is checked separately, so that a later layer can't hide a mistake. Numbers of a layer with a reference robot
     are rescaled for `robot`, or if `robot` is None, for the robot that the layers name.
@@ -219,14 +219,14 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
         if not isinstance(cpu, Mapping):
             raise ConfigError(f"{name}: cpu: expected a mapping of sections, got {shown(cpu)}")
         if "task" in cpu:
-            raise ConfigError(f"{name}: cpu: task: a task has one name on every machine")
+            raise ConfigError(f"{name}: cpu: task: a task has the same name on every machine; remove this key")
         build(schema, cpu, "", Origins(), f"{name}: cpu")
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
-    """Return the setting `robot` of a file in `folder`. A path becomes absolute. It is a path if it has a slash or a leading
-    dot, or names a folder next to the file or in the working directory. Names of robots under resources/robots/ are returned
-    unchanged.
+    """Return the setting `robot` of a file in `folder`. A path becomes absolute. The setting is a path if it has a slash or a
+    leading dot, or names a folder next to the file or in the working directory. Names of robots under resources/robots/ are
+    returned unchanged.
     """
     if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
         return robot
@@ -237,8 +237,8 @@ def robot_path(robot: Any, folder: Path) -> Any:
 
 
 def actuator_path(section: Any, folder: Path) -> None:
-    """Make the path of a learned actuator absolute, in a section of a file in `folder`. The path is relative to that folder,
-    or else to the working directory.
+    """Make the path of a learned actuator in `section` absolute. The path is relative to `folder`, the folder of the
+    configuration file, or else to the working directory.
     """
     for key in ("control", "actuator"):
         section = section.get(key) if isinstance(section, Mapping) else None
@@ -278,8 +278,8 @@ def load_config(
     """Load the configuration of a task as an instance of `schema`.
 
     The file or mapping `source` is merged onto the configurations that it extends, which are files or tasks in `registered`.
-    On a CPU their `cpu:` sections count. Overrides come last. `rescale` rescales the numbers that are written for another
-    robot, except overrides.
+    With `on_cpu` their `cpu:` sections are merged too. Overrides come last. `rescale` converts numbers that were written for
+    another robot, but no overrides.
 
     Raises:
         ConfigError: an unknown key, a wrong type or a wrong value; the text names file and dotted path.
@@ -303,7 +303,7 @@ def _merge_overrides(
     """
     for key, value in overrides:
         if key == "task":
-            raise ConfigError("command line: task: can't be overridden; name the task first")
+            raise ConfigError("command line: task: can't be overridden; give the name of the task as the first argument")
         if key.count(".") > DEEPEST:
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} nested sections")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
@@ -333,7 +333,7 @@ def from_dict(
 
 
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return a copy of `cfg` with the settings of some dotted paths replaced and checked."""
+    """Return a copy of `cfg` with some settings replaced and checked. `overrides` are pairs of a dotted path and a value."""
     data = to_dict(cfg)
     origins = Origins(cfg.origins)
     _merge_overrides(data, overrides, origins, type(cfg))

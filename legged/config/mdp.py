@@ -20,7 +20,7 @@ class ControlConfig:
 
 @dataclass(frozen=True)
 class TerminationsConfig:
-    """Terms `_terminate_<name>` that end an episode, in addition to its length and NaN or infinite numbers."""
+    """Terms `_terminate_<name>` that end an episode. NaN, infinite numbers and the time limit also end it."""
 
     failures: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Terms that end an episode as a failure. The learner expects no reward after it."""
@@ -35,13 +35,13 @@ class DomainRandConfig:
     ranges: dict[str, Range | DrawConfig] = field(
         default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> range of a uniform distribution, from which each robot's value is drawn at the start. A mapping with the
-    range as `range` also sets distribution and time. Properties: legged/physics/fields.py."""
+    """Property -> range of a uniform distribution, from which each robot's value is sampled at the start; or a mapping with
+    `range`, `distribution`, `when` and more (DrawConfig). Properties: legged/physics/fields.py."""
     observed_ranges: dict[str, Range | DrawConfig] = field(
         default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> range of a property that is observed (`_obs_rand_<property>`) but not randomised, or not with this range.
-    Play and evaluation put the ranges of the training here."""
+    """Property -> range that scales the observation `_obs_rand_<property>`; by default that in `ranges`. Play and evaluation
+    put the ranges of the training here."""
 
     def nominal(self) -> Self:
         """Return a copy without randomisation, for play and evaluation. Observations keep their scales."""
@@ -77,8 +77,8 @@ class ObservationsConfig:
     """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
-    """Group -> terms, history and noise of the group. The group `actor` is the policy's by default; `train.policy` sets the
-    groups of each network."""
+    """Group -> terms, history and noise of the group. `train.policy` sets the groups that each network reads; by default the
+    policy reads the group `actor`."""
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
     """Term -> factor; 1 for other terms."""
     add_noise: bool = True
@@ -88,15 +88,15 @@ class ObservationsConfig:
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)))
-    """Term -> half width of an error that is constant in an episode, for each of its numbers, in the term's unit before
-    scaling. Bias, delay and lost packets affect only groups with noise, and only while `add_noise` is on."""
+    """Term -> half width of a constant error in each of the term's numbers, sampled for each episode, in the term's unit
+    before scaling. Bias, delay and lost packets affect only groups with noise, and only while `add_noise` is on."""
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
-    """Term -> range of each robot's delay, drawn for an episode, in control steps."""
+    """Term -> range of its delay, in control steps. Each robot's delay is sampled for each episode."""
     dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Term -> share of the control steps in which its packet is lost. The values of the previous step are then kept."""
     clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Absolute value at which scaled observations are clipped."""
 
     def trained(self) -> Self:
-        """Return the observations of a trained policy, in play, evaluation and export."""
+        """Return the settings of a trained policy's observations for play, evaluation and export."""
         return self

@@ -20,7 +20,7 @@ def groups_in(cfg: TaskConfig) -> dict[str, ObservationGroupConfig]:
 
 
 def path_of_terms(cfg: TaskConfig, group: str) -> str:
-    """Return the dotted path of the setting with the terms of an observation group."""
+    """Return the dotted path of the setting that lists the terms of an observation group."""
     is_targets = group == ESTIMATED and bool(cfg.train.policy.estimator.targets)
     return "train.policy.estimator.targets" if is_targets else f"observations.groups.{group}.terms"
 
@@ -68,7 +68,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
 
     Raises:
         ConfigError: the estimator has outputs but no targets, the name of its group is taken, or a setting needs rsl-rl's own
-            update, because that update has no estimator.
+            update, which cannot train an estimator.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     path = "train.policy.estimator.targets"
@@ -79,7 +79,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
         return
     if ESTIMATED in cfg.observations.groups:
         where = origins.where(f"observations.groups.{ESTIMATED}")
-        raise ConfigError(f"{where}: '{ESTIMATED}' is the group of the estimator's targets ({path}); give it another name")
+        raise ConfigError(f"{where}: '{ESTIMATED}' is the group of the estimator's targets ({path}); rename yours")
     for field, value, wanted in (
         ("train.policy.rnn_type", policy.rnn_type, "none"),
         ("train.policy.state_dependent_std", policy.state_dependent_std, False),
@@ -104,10 +104,10 @@ def _check_student(cfg: TaskConfig) -> None:
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:
         where = origins.where("train.policy.state_dependent_std")
-        raise ConfigError(f"{where}: a student learns the mean of the actions alone; must be false")
+        raise ConfigError(f"{where}: must be false, because a student learns the mean of the actions alone")
     if policy.estimator.targets:
         where = origins.where("train.policy.estimator.targets")
-        raise ConfigError(f"{where}: a student learns no estimator; must be []")
+        raise ConfigError(f"{where}: must be [], because a student learns no estimator")
     length, steps = cfg.train.distillation.gradient_length, cfg.train.runner.num_steps_per_env
     if steps % length:
         where = origins.where("train.distillation.gradient_length")
@@ -120,13 +120,13 @@ def _check_recurrent(cfg: TaskConfig) -> None:
     """Check a recurrent policy against the settings of the learner.
 
     Raises:
-        ConfigError: the policy is to learn from mirror images, or there are fewer robots than mini-batches.
+        ConfigError: symmetry is on, or there are fewer robots than mini-batches.
     """
     kind, algorithm, origins = cfg.train.policy.rnn_type, cfg.train.algorithm, cfg.origins
     recurrent = f"a recurrent policy (train.policy.rnn_type={kind}, {origins.of('train.policy.rnn_type')})"
     if algorithm.symmetry:
         where = origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {recurrent} can't learn from mirror images; train.algorithm.symmetry=false")
+        raise ConfigError(f"{where}: {recurrent} can't learn from mirror images; set train.algorithm.symmetry=false")
     if algorithm.num_mini_batches > cfg.env.num_envs:
         where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
         raise ConfigError(

@@ -12,7 +12,7 @@ KICK = between(-1000, 1000)
 
 @dataclass(frozen=True)
 class DrawConfig:
-    """Randomisation of one property, the long form of an entry of `domain_rand.ranges`."""
+    """Randomisation of one property. This is the long form of an entry of `domain_rand.ranges`; a range is the short form."""
 
     range: Range = field(default=(0.0, 0.0), metadata=between(-LARGEST, LARGEST))
     """Lowest and highest value, in the unit of the property."""
@@ -23,16 +23,16 @@ class DrawConfig:
     """Standard deviation of `gaussian` before it is cut off, in the unit of the property; 0 for a quarter of the range's
     width."""
     when: Literal["start", "reset", "interval"] = "start"
-    """Time of a draw: once before training (`start`), at the beginning of each episode (`reset`), or every `interval_s`
-    (`interval`), at separate times for each robot."""
+    """Time at which a robot's value is sampled: once before training (`start`), at the beginning of each episode (`reset`),
+    or every `interval_s` (`interval`), at different times for different robots."""
     interval_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
-    """Time between two draws of a robot [s], with `interval` only."""
+    """Time after which a robot's value is sampled anew [s]. Only for `when: interval`."""
     each: bool | None = None
-    """Draw a value for each part that has the property (joint, body, shape), or one for the whole robot; null for the
-    property's default."""
+    """True: sample a value for each part that has the property (joint, body, shape). False: sample one value for the whole
+    robot. Null: the property's default."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """First and last iteration of the range's widening; [0, 0] for the full width at once. The range starts from the
-    property's neutral value, or from its nearest end if that value is outside the range."""
+    """First and last training iteration in which the range widens; [0, 0] for the full range at once. It widens from the
+    property's neutral value or, if the range excludes this value, from the nearer end of the range."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class KickConfig:
     """Sudden changes of the base's velocity."""
 
     interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Range of the time between two kicks of a robot, drawn after each kick [s]."""
+    """Range of the time between two kicks of a robot, sampled after each kick [s]."""
     x: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """Range of the change of the base's velocity along x, world frame [m/s]."""
     y: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
@@ -62,9 +62,9 @@ class ForceConfig:
     """Temporary force on a body of the robot, at random intervals."""
 
     body: str = ""
-    """Body of the robot's model; empty is the base."""
+    """Body of the robot's model; empty for the base."""
     interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Range of the time from the end of a push to the robot's next push, drawn for each push [s]."""
+    """Range of the time from the end of a push to the robot's next push, sampled for each push [s]."""
     duration_s: Range = field(default=(0.1, 0.5), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of a push's duration [s]. It is rounded to whole control steps, at least one."""
     x: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))

@@ -21,19 +21,19 @@ class FieldText:
     """Description of one field of a configuration."""
 
     path: str
-    """Dotted path, as on the command line; `<name>` stands for the entry of a map."""
+    """Dotted path, as on the command line; `<name>` stands for the name of an entry in a map."""
     kind: str
     """Accepted values, such as "a number" or "one of P, V, T"."""
     default: Any
     """Default as plain values; None for a section, because its fields have defaults."""
     unit: str
-    """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty without one, or if each entry has its own."""
+    """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty for maps with several units."""
     bounds: str
-    """Bounds of the field's numbers; empty without any."""
+    """Bounds of the field's numbers, in words; empty if they have no bounds."""
     meaning: str
     """Docstring of the field, on one line."""
     choices: tuple[str, ...] = ()
-    """All values that the field can have, if they are few."""
+    """All values that the field can have; empty if they cannot be listed."""
     is_section: bool = False
     """True if the field is a section. The section's own fields follow."""
 
@@ -77,7 +77,7 @@ def _meanings(schema: type) -> dict[str, str]:
 
 
 def meaning_of(schema: type, name: str) -> str:
-    """Return the docstring of a field from the nearest class that has one, or an empty text."""
+    """Return the docstring of a field: that of the class, else of its nearest base class. It may be empty."""
     classes = [kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]
     return next((_meanings(kind)[name] for kind in classes if name in _meanings(kind)), "")
 
@@ -113,7 +113,7 @@ def bounds_of(metadata: Mapping[str, Any]) -> str:
     if "items" in metadata:
         parts.append(f"{0 if metadata.get('may_be_empty') else 1} to {metadata['items']} items")
     if metadata.get("unique"):
-        parts.append("none twice")
+        parts.append("without duplicates")
     if metadata.get("name"):
         parts.append("a name that a folder can have")
     return ", ".join(parts)

@@ -16,7 +16,7 @@ REPLACED: dict[str, tuple[str, dict[str, str | None]]] = {
     "sim.constraint_solver": ("sim.step", {"auto": None, "fused": "fused", "rounds": "library"}),
     "sim.smooth_dynamics": ("sim.step", {"auto": None, "fused": "fused", "stages": "library"}),
 }
-"""Old dotted path -> setting that replaces it, with old value -> new value; None if the setting need not be set."""
+"""Old dotted path -> (new dotted path, map: old value -> new value). A new value of None leaves the default."""
 
 
 def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
@@ -38,7 +38,7 @@ def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return a copy of `data` with replaced settings expressed by their new ones."""
+    """Return a copy of `data` in which each setting of REPLACED is converted to its successor."""
     result = dict(data)
     for old, (new, meanings) in REPLACED.items():
         section, _, key = old.rpartition(".")
@@ -48,7 +48,7 @@ def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
         value, name = found[key], new.rpartition(".")[2]
         rest = {other: item for other, item in found.items() if other != key}
         if not isinstance(value, str) or value not in meanings:
-            raise ConfigError(f"{source}: {old}: replaced by {new}: auto, fused or library; got {shown(value)}")
+            raise ConfigError(f"{source}: {old}: replaced by {new}, which can be auto, fused or library; got {shown(value)}")
         meaning = meanings[value]
         if meaning is not None and rest.get(name, meaning) != meaning:
             raise ConfigError(f"{source}: {old}: {shown(value)} now means {new}={meaning}, but {new} is {shown(rest[name])}")
@@ -57,7 +57,7 @@ def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _put(data: dict[str, Any], path: list[str], value: Any, conflict: str) -> None:
-    """Set the value at a path of keys. Maps on the way are copied."""
+    """Set the value at a path of keys, in copies of the maps on the way. An existing value is the error `conflict`."""
     key, *rest = path
     if not rest:
         if key in data:

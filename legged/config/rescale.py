@@ -1,7 +1,7 @@
 """Rescaling of a configuration's numbers from its reference robot to another robot, by dynamic similarity.
 
-The fields define the unit of each number. `rescaled` (bounds.py) gives a field its unit. For scales and noise of a term,
-`@unit` declares the unit. Each size of a terrain type and each range of a randomised property has the unit of its entry.
+Only numbers with a unit are rescaled. `rescaled` (bounds.py) sets the unit of a field. Scales and noise of a term have the
+unit that `@unit` declares. Sizes of a terrain type and ranges of a property have the unit of that type or property.
 """
 
 import dataclasses
@@ -12,16 +12,16 @@ from typing import Any
 from legged.config.checks import hints_of
 
 Factor = Callable[[str], float]
-"""Function: unit -> factor on a quantity of that unit, from the reference robot to the other robot."""
+"""Function: unit -> factor that converts a quantity of that unit from the reference robot to the other robot."""
 UnitOf = Callable[[str], str]
-"""Function: name of a term's method, such as "_reward_torques", or dotted path of an entry, such as "terrain.sizes.step" ->
-unit."""
+"""Function: name -> unit. The name is that of a term's method, such as "_reward_torques", or the dotted path of an entry,
+such as "terrain.sizes.step"."""
 DIGITS = 6
 """Significant digits of a rescaled number, few enough to read."""
 
 
 def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
-    """Return the nested values `data`, which fit `schema`, with all numbers that have a unit rescaled."""
+    """Return a copy of the nested values `data`, which fit `schema`. All numbers that have a unit are rescaled."""
     fields = {f.name: f for f in dataclasses.fields(schema)}
     hints = hints_of(schema)
     rescaled: dict[str, Any] = {}
@@ -50,7 +50,7 @@ def _of_sections(hint: Any) -> bool:
 
 
 def _times_entry(value: Any, by: float) -> Any:
-    """Return an entry of a map times a factor. In an entry that is a section, only the values in the entry's unit change."""
+    """Return an entry of a map times a factor. In a section only `range` and `std` change, which have the entry's unit."""
     if not isinstance(value, Mapping):
         return times(value, by)
     return {key: times(item, by) if key in ("range", "std") else item for key, item in value.items()}

@@ -1,4 +1,4 @@
-"""Configuration of any kind of task. A task class with its own sections has a subclass as `Config`."""
+"""Configuration of any kind of task. A task class with more sections has a subclass of TaskConfig as its `Config`."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
@@ -17,7 +17,7 @@ class TaskConfig:
     task: str = field(default="", metadata=NAME)
     """Name of the task, set by the registry."""
     env: EnvConfig = field(default_factory=EnvConfig)
-    """Size and length of the simulated batch."""
+    """Number of robots, length of episodes, and seed."""
     sim: SimConfig = field(default_factory=SimConfig)
     """Physics time step, engine and contact solver."""
     control: ControlConfig = field(default_factory=ControlConfig)
@@ -35,7 +35,7 @@ class TaskConfig:
     custom: dict[str, Any] = field(default_factory=dict)
     """Free section for user-defined terms: `self.cfg.custom["name"]`."""
     origins: Origins = field(default_factory=Origins, repr=False, compare=False)
-    """Sources of the settings. This is not itself a setting (`compare` is False), so files neither set nor store it."""
+    """Sources of the settings. `compare=False` marks that this is no setting: files neither set nor store it."""
 
     def trained(self) -> Self:
         """Return the configuration for play and evaluation of a trained policy: without randomisation, and with the

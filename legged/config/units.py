@@ -18,7 +18,7 @@ BASE = {
     "deg": (0, 0, 0),
     "1": (0, 0, 0),
 }
-"""Unit -> exponents of mass, length and time. An angle is a ratio of lengths."""
+"""Unit -> exponents of mass, length and time. Angles have no dimension."""
 Exponents = tuple[int, int, int]
 SPELLINGS = {"**": "^", "*": " ", "·": " ", "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "^-^": "^-", "¹": "1"}
 """Other spellings of powers and products -> the spelling used here."""

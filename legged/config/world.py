@@ -1,4 +1,4 @@
-"""Settings of the simulated world: batch and physics."""
+"""Settings of the simulated world: robots, episodes and physics."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -10,15 +10,15 @@ NewtonSolver = Literal["mujoco", "steel", "kamino", "featherstone", "xpbd", "sem
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Size and length of the simulated batch."""
+    """Number of robots, length of episodes, and seed."""
 
     num_envs: int = field(default=4096, metadata=between(1, 2**20))
     """Number of robots simulated in parallel on each GPU."""
     episode_length_s: float = field(default=20.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time-out of an episode [s]."""
     seed: int = field(default=1, metadata=between(0, 2**62))
-    """Seed of torch's generators and of the terrain. Physics uses no random numbers. With several GPUs, the robots of each
-    GPU have the seed plus its rank."""
+    """Seed of torch's generators and of the terrain. Physics uses no random numbers. With several GPUs, each
+    process adds its rank to the seed of its robots."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class SimConfig:
     dt: float = field(default=0.005, metadata=quantity("s", positive(0.1, low=1e-5)))
     """Physics step [s]; the control step is `dt * control.decimation`."""
     cone: Literal["pyramidal", "elliptic"] = "pyramidal"
-    """Type of friction cone. With the pyramidal cone and impratio 10, a standing ANYmal C sinks 1 cm from 2 s to 5 s. The
-    elliptic cone takes twice the time."""
+    """Type of friction cone. With the pyramidal cone and impratio 10, a standing ANYmal C sinks by 1 cm between 2 s and
+    5 s of simulated time. The elliptic cone needs twice the computing time."""
     impratio: float = field(default=10.0, metadata=positive(1e5, low=1e-3))
     """Stiffness of friction relative to the normal direction. With 1, loaded feet creep outward; 100 needs 50 or more
     iterations."""
@@ -46,9 +46,9 @@ class SimConfig:
     """Largest number of line-search iterations per solver iteration."""
     step: Literal["auto", "fused", "library"] = "auto"
     """Implementation of a physics step in mujoco_warp. `library`: mujoco-warp's own code, which has dozens of launches.
-    `fused`: one launch each for the part before contacts, for contacts, for their forces and for integration; a model that
-    does not fit is an error. `auto`: `fused` where the model fits; else fused contact forces where those fit (60 degrees of
-    freedom)."""
+    `fused`: four launches, for the part before contacts, contacts, contact forces and integration; models that it does not
+    support are refused. `auto`: `fused` for models that it supports, else only the contact forces are fused, for models of up
+    to 60 degrees of freedom."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
     """Contacts allocated per robot in mujoco_warp and newton. The libraries' own collision launches share the contacts among
     all robots, and also use some for shapes that are close but do not touch."""

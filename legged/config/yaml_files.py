@@ -21,8 +21,8 @@ MOST_VALUES = 100_000
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with four changes. It reads `1e-4` and `-.5` as numbers, unlike YAML 1.1. It merges keys `<<`. It refuses
-    repeated keys, and numbers that YAML 1.2 reads differently. It refuses texts that would take forever to read.
+    """SafeLoader that reads `1e-4` and `-.5` as numbers, unlike YAML 1.1. It refuses repeated keys, numbers that YAML 1.2
+    reads differently, and texts that would take forever to read.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -63,9 +63,7 @@ class _Loader(yaml.SafeLoader):
         return size, depth
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Refuse a repeated key. This happens before merge keys are expanded, because a block may override the keys that it
-        merges.
-        """
+        """Refuse a repeated key. Later the merge keys `<<` are expanded, and a block may override keys that it merges."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -86,7 +84,7 @@ class _Loader(yaml.SafeLoader):
         return number
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """Construct an object as the constructor does. For an invalid number or date, raise an error with its line."""
+        """Construct an object as SafeLoader does. For an invalid number or date, raise an error that names the line."""
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError) as error:

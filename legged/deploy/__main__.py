@@ -26,20 +26,20 @@ from legged.process.command_parser import CommandParser, argument, check_between
 from legged.process.paths import ready_to_write
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
-"""Signals that end the program after the robot was braked: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\ and
-Ctrl-Z. By default most of them would leave the robot with its last command."""
+"""Signals at which the program brakes the robot and then ends: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\
+and Ctrl-Z. By default most of them would leave the robot with its last command."""
 SWITCH_S = 5e-4
 """Python's switch interval between threads [s]; the default of 5 ms is a quarter of a cycle."""
 EXIT_STOPPED = 3
-"""The program ran to its end, but had stopped the robot for safety."""
+"""Exit code of a program that ran to its end, but had stopped the robot for safety."""
 PROGRAM = (
-    argument("--input", choices=tuple(HELP), default="keyboard", help="who commands; default keyboard"),
+    argument("--input", choices=tuple(HELP), default="keyboard", help="source of commands; default keyboard"),
     argument("--gamepad", type=Path, default=DEVICE, help=f"device; default {DEVICE}"),
     argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad"),
     argument("--seconds", type=float, default=float("inf"), help="end after this time [s]; default: when the operator quits"),
     argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3"),
-    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop beyond this tilt [rad]; {Limits.max_tilt:g}"),
-    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop if data are older [s]; {Limits.max_age_s:g}"),
+    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop above this [rad]; default {Limits.max_tilt:g}"),
+    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop at older data [s]; default {Limits.max_age_s:g}"),
     argument(
         "--max-missed",
         type=int,
@@ -109,7 +109,7 @@ def _main(argv: list[str] | None) -> int:
         opened.callback(robot.close)
         operator.take()
         program = Program(policy, robot, operator, limits, args.stand_seconds, tell=tell)
-        opened.pop_all()  # the program closes them
+        opened.pop_all()  # from now on `program` closes operator and robot
     sys.setswitchinterval(SWITCH_S)
     hurry = "with priority" if hurries else "without priority (rtprio), so cycles may begin late on a busy machine"
     tell(f"{policy.contract.task} on {robot.facts.name}, {1.0 / policy.contract.control_dt:g} Hz, {hurry}")
@@ -126,7 +126,8 @@ def _main(argv: list[str] | None) -> int:
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """Return the limits that the flags set, in seconds, radians and cycles. The ranges exclude degrees and milliseconds.
+    """Return the limits that the flags set, in seconds, radians and cycles. Their ranges refuse a tilt in degrees or an age
+    in milliseconds.
 
     Raises:
         ConfigError: a number is outside its range.
@@ -155,7 +156,7 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 class Interruptible(Operator):
     """An operator that also ends the program at signals such as Ctrl-C (`ENDING`). A connected robot is braked first; without
-    one the program ends at once.
+    a robot the program ends at once.
     """
 
     def __init__(self, operator: Operator) -> None:

@@ -16,7 +16,7 @@ from legged.errors import ConfigError
 CONTRACT_VERSION = 1
 """Version of policy.json that this package writes and reads."""
 CHECKSUMS = "sha256"
-"""Key of policy.json: file of the export -> its SHA-256 in hexadecimal digits. Older exports lack the key."""
+"""Key of the checksums in policy.json: file of the export -> SHA-256 in hexadecimal digits. Older exports lack this key."""
 NOT_COMPARED = {CHECKSUMS, "iterations", "wall_s"}
 """Keys of policy.json that may differ from the metadata of the ONNX file: the checksums, and the length of the training."""
 SENSORS = {
@@ -29,10 +29,10 @@ SENSORS = {
 }
 """Observation term -> sensor, command or memory that it needs, for the terms that every robot can provide."""
 SOURCE = "source "
-"""Prefix of the need of every other term. The name of a source follows, such as an estimator or a map."""
+"""Prefix of the need of any other term, before the name of its source, as in "source heights"."""
 SCANS = ("lowest", "own", "highest")
-"""Values that a point of the heights can read: the lowest of its cell and the next cells in x and y, its own cell's, or the
-highest of the three."""
+"""Values that a point of the heights can read: the lowest height of its cell and the next cells in x and y, the height of its
+own cell, or the highest of the three."""
 TOLERANCE = 1e-3
 """Largest difference, absolute or relative, at which limits count as equal."""
 DEEPEST, MOST_DIGITS = 20, 18
@@ -51,7 +51,7 @@ RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
 
 
 def plain_json(text: str | bytes) -> Any:
-    """Return the value of JSON from outside this program, such as a file or a packet.
+    """Return the value of a JSON text from outside this program, such as a file or a packet.
 
     Raises:
         ValueError: the text is no JSON, is nested too deeply, or has whole numbers that are too long.
@@ -76,7 +76,7 @@ def plain_json(text: str | bytes) -> Any:
 
 
 def need_of(term: str) -> str:
-    """Return the need of an observation term: a value of SENSORS, or a source of the term's name."""
+    """Return the need of an observation term: its entry in SENSORS, else a source with the term's name."""
     return SENSORS.get(term, f"{SOURCE}{term}")
 
 
@@ -130,9 +130,9 @@ class Contract:
     default: np.ndarray
     """(D,) angles at action 0 [rad]."""
     crouch: np.ndarray | None
-    """(D,) intermediate pose for standing up from the ground [rad]; None without one."""
+    """(D,) intermediate pose for standing up from the ground [rad]; None if the robot has none."""
     stiffness: np.ndarray
-    """(D,) P gains [N m/rad], and D gains [N m s/rad]."""
+    """(D,) P gains [N m/rad]; `damping` (D,) are the D gains [N m s/rad]."""
     damping: np.ndarray
     position_limits: np.ndarray
     """(D, 2) [rad]; infinite where the model has no limit."""
@@ -148,13 +148,13 @@ class Contract:
     command_ranges: np.ndarray
     """(3, 2) lowest and highest vx, vy [m/s] and yaw rate [rad/s]."""
     dead_zone: float
-    """Smallest horizontal command of the training other than zero [m/s]."""
+    """Smallest horizontal speed that was commanded in training, apart from zero [m/s]."""
     control_dt: float
     """Time for which an action is held [s]."""
     sim_dt: float
     """Physics step of the training; the unit of the actuator's delay [s]."""
     actuator: Mapping[str, Any]
-    """Section control.actuator of the training's configuration; empty for exports without it."""
+    """Section control.actuator of the training's configuration; empty if the export lacks it."""
     states: Mapping[str, tuple[int, int, int]]
     """Input of the ONNX file -> shape (layers, 1, width) of a hidden state; empty for a policy without memory."""
 
@@ -174,7 +174,7 @@ class Contract:
         return {term.source: term for term in self.terms if term.source is not None}
 
     def check_metadata(self, network: Path, metadata: Mapping[str, str]) -> None:
-        """Compare all entries with `metadata` of the ONNX file `network`, which are JSON texts by key.
+        """Compare all entries with `metadata` of the ONNX file `network`: key -> JSON text.
 
         Raises:
             ConfigError: the metadata are no contract, or come from another export.
@@ -184,13 +184,13 @@ class Contract:
         except ValueError:
             inside = {}
         if "contract_version" not in inside:
-            raise ConfigError(f"{network}: has no metadata of an export; they must equal {self.path}")
+            raise ConfigError(f"{network}: has no metadata of an export; its entries must equal {self.path}")
         for key in sorted({*inside, *self.entries} - NOT_COMPARED):
             if key not in inside or key not in self.entries or inside[key] != self.entries[key]:
-                raise ConfigError(f"{self.path}: {key}: differs from that of {network}; the files are of different exports")
+                raise ConfigError(f"{self.path}: {key}: differs from that of {network}; the files are from different exports")
 
     def check_fits(self, robot: RobotFacts) -> None:
-        """Compare with a robot.
+        """Compare the contract with a robot.
 
         Raises:
             ConfigError: the robot's joints have other names or another order, or are weaker, slower or stop earlier than in
@@ -201,18 +201,18 @@ class Contract:
         if self.imu_body != robot.imu_body:
             raise ConfigError(
                 f"{self.path}: imu_frame: the policy observes in the frame of '{self.imu_body}',"
-                f" the IMU of '{robot.name}' measures in that of '{robot.imu_body}'"
+                f" but the IMU of '{robot.name}' measures in that of '{robot.imu_body}'"
             )
         for name, unit in (("torque_limits", "N m"), ("velocity_limits", "rad/s")):
             for joint, mine, its in zip(self.joint_names, getattr(self, name), getattr(robot, name), strict=True):
                 if not mine <= its * (1.0 + TOLERANCE):  # also true for a limit of NaN
                     trained = f"the policy was trained with {mine:g} {unit} at '{joint}'"
-                    raise ConfigError(f"{self.path}: {name}: {trained}, '{robot.name}' has {its:g}")
+                    raise ConfigError(f"{self.path}: {name}: {trained}, but '{robot.name}' has {its:g}")
         for joint, mine, its in zip(self.joint_names, self.position_limits, robot.position_limits, strict=True):
             if mine[0] < its[0] - TOLERANCE or mine[1] > its[1] + TOLERANCE:
                 raise ConfigError(
                     f"{self.path}: position_limits: the policy was trained with {mine[0]:g} to {mine[1]:g} rad at '{joint}',"
-                    f" '{robot.name}' has {its[0]:g} to {its[1]:g}"
+                    f" but '{robot.name}' has {its[0]:g} to {its[1]:g}"
                 )
         for source, term in self.sources.items():
             if source not in robot.offers:
@@ -238,9 +238,9 @@ def read_contract(path: Path) -> Contract:
             raise ConfigError(f"{path}: task: '{said.get('task')}' is no task of a legged robot that follows commands")
         version = said.get("contract_version")
         if version != CONTRACT_VERSION:
-            was = "none: an older version of this package wrote it" if version is None else f"{version!r}"
+            was = "none, because an older version wrote it" if version is None else f"{version!r}"
             raise ConfigError(
-                f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}: export the policy again"
+                f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}; export the policy again"
                 f" (legged play {said.get('task')} --no-video)"
             )
         if (control := said.get("control_type")) != "P":
@@ -342,7 +342,7 @@ def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]
                 raise ConfigError(f"{where}: '{term.name}' must start at column {column}, got {term.start}")
             column += term.size
         if column != start + size:
-            raise ConfigError(f"{where}_groups: '{entry['name']}' has {size} numbers, its terms {column - start}")
+            raise ConfigError(f"{where}_groups: '{entry['name']}' has {size} numbers, but its terms have {column - start}")
         yield Group(start, size, history, tuple(terms))
         start += size * history
 
@@ -355,11 +355,11 @@ def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Ter
     if source is None and needs != SENSORS.get(name):
         raise ConfigError(f"{where}: '{name}' cannot be made from '{needs}'")
     if source is None and size != sizes[name]:
-        raise ConfigError(f"{where}: '{name}' has {size} numbers, a robot gives {sizes[name]}")
+        raise ConfigError(f"{where}: '{name}' has {size} numbers, but a robot gives {sizes[name]}")
     if scale.shape != (size,) or not np.isfinite(scale).all():
         raise ConfigError(f"{where}: scale of '{name}': must be {size} finite numbers, got {entry['scale']}")
     if source == "heights" and len(points) != size:
-        raise ConfigError(f"{where}: 'heights' has {size} numbers and {len(points)} points")
+        raise ConfigError(f"{where}: 'heights' has {size} numbers, but {len(points)} points")
     if scan not in SCANS:
         raise ConfigError(f"{where}: scan of '{name}': must be one of {', '.join(SCANS)}, got '{scan}'")
     return Term(

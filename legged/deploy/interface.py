@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """Properties of a robot with D joints, in the order of its readings and commands."""
+    """Properties of a robot with D joints. The joints have the order of readings and commands."""
 
     name: str
     joint_names: tuple[str, ...]
@@ -67,8 +67,8 @@ class Interface(ABC):
 
     @abstractmethod
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
-        """Command the torques stiffness * (positions - q) - damping * dq until the next call, (D,) each [rad], [N m/rad],
-        [N m s/rad].
+        """Command the torques stiffness * (positions - q) - damping * dq until the next call. Each argument is (D,): [rad],
+        [N m/rad], [N m s/rad].
         """
 
     @abstractmethod

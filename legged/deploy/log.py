@@ -16,7 +16,7 @@ from legged.process.paths import make_folder, replacing
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Numbers of newest rows that are kept: 20 minutes at 250 readings and 50 cycles per second, a few hundred megabytes."""
+"""Largest numbers of rows; older rows are dropped. They last for 20 minutes at 250 readings and 50 cycles per second."""
 SHORTEST = 20
 """Smallest number of samples without a gap that is used for fitting."""
 UNEVEN = 0.75
@@ -96,7 +96,7 @@ class Log:
         beside, samples = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
         with replacing(path) as part:
             np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-            beside.unlink(missing_ok=True)  # another run may have left it
+            beside.unlink(missing_ok=True)  # an earlier run may have left this file
         if samples is not None:
             with replacing(beside) as part:
                 np.savez_compressed(part, allow_pickle=False, **samples)  # type: ignore[arg-type]
@@ -116,7 +116,7 @@ def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[s
         usable &= np.isfinite(log[name]).all(axis=1)
     new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
     rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
-    if len(rows) < SHORTEST:  # this is also so if the robot has no clock
+    if len(rows) < SHORTEST:  # also without a clock, when all readings have the same time
         return None
     steps = np.diff(log["times"][rows])
     usual = float(np.median(steps))

@@ -87,7 +87,7 @@ DEVICE = Path("/dev/input/js0")
 AXES = {1: (0, -1.0), 0: (1, -1.0), 3: (2, -1.0)}
 """Number of an axis -> axis of the command and sign: left stick up, left stick left and right stick left are positive."""
 BUTTONS = {0: Event.WALK, 1: Event.STOP, 2: Event.DAMPING, 3: Event.STAND, 6: Event.QUIT, 7: Event.IDLE}
-"""Number of a button -> event; on an Xbox gamepad A, B, X, Y, back and start."""
+"""Number of a button -> event. On an Xbox gamepad these buttons are A, B, X, Y, back and start."""
 HELP = {
     "keyboard": "0 idle, 1 damping, 2 stand up, 3 walk, space stop, x quit; w s forward and back, a d left and right, q e"
     f" turn, r no command; a command ends {SILENCE_S:g} s after the last key",
@@ -104,7 +104,7 @@ class Orders:
     events: tuple[Event, ...] = ()
     """Events since the last poll, oldest first."""
     shares: bool = False
-    """`velocity` is a share, -1 to 1, of the policy's command range, like the position of a stick."""
+    """True if `velocity` has shares, -1 to 1, of the policy's command ranges, such as the positions of a stick."""
     lost: str | None = None
     """Reason why the operator can no longer be reached; None while it can."""
 
@@ -121,7 +121,7 @@ class Operator(ABC):
 
 
 class Ramp:
-    """Commands for the policy: zero, or within its ranges and above its dead zone, with a limited rate of change."""
+    """Commands for the policy: clipped to its ranges, zero within its dead zone, and with a limited rate of change."""
 
     def __init__(self, contract: Contract) -> None:
         self._low, self._high = contract.command_ranges.T
@@ -194,7 +194,7 @@ class Script(Operator):
 
 
 class _Device(Operator):
-    """An operator with an open device, whose commands are shares of the largest command. A closed device counts as lost."""
+    """An operator with an open device. Commands are shares of the largest command. If the device is closed, it is lost."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         self._descriptor, self._name = descriptor, name
@@ -257,7 +257,7 @@ class Keyboard(_Device):
     def close(self) -> None:
         import termios
 
-        with suppress(termios.error):  # the terminal may be closed. TCSANOW does not wait for a held terminal
+        with suppress(termios.error):  # the terminal may be closed. TCSANOW does not wait if Ctrl-S holds it
             termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
 

@@ -80,7 +80,7 @@ class Pace:
 
 
 class StatusMessages:
-    """Prints lines in its own thread, so that a held (Ctrl-S), closed or slow terminal does not delay the robot."""
+    """Printer in its own thread, so that a held (Ctrl-S), closed or slow terminal does not delay the robot."""
 
     def __init__(self, say: Callable[[str], object] | None = None) -> None:
         """Start the thread; `say` prints a line, by default to standard output."""

@@ -50,12 +50,12 @@ class Network:
         wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
         found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
         if list(found.items()) != list(wanted.items()):  # sizes of the batch have names in place of numbers
-            raise ConfigError(f"{path}: takes {found}; policy.json says {wanted}")
+            raise ConfigError(f"{path}: takes {found}, but policy.json says {wanted}")
         self.restart()
         for _ in range(WARM_UP):
             actions = self.run(np.zeros(contract.width, dtype=np.float32))
         if actions.shape != contract.acted.shape:
-            raise ConfigError(f"{path}: gives {actions.size} actions, policy.json says {len(contract.acted)}")
+            raise ConfigError(f"{path}: gives {actions.size} actions, but policy.json says {len(contract.acted)}")
         if not np.isfinite(actions).all():
             raise ConfigError(f"{path}: gives actions that are not finite for an observation of zeros")
         self.restart()

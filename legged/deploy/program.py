@@ -24,7 +24,7 @@ FAR = 100.0
 HALT_S = 1.0
 """Time for which a walking robot gets the command zero before it stands, because stopping at 1 m/s would make it fall [s]."""
 RETURN_S = 0.3
-"""Time to reach the default pose from walking or from nearby; a slower robot would tip over [s]."""
+"""Time to reach the default pose from walking or from a pose nearby; a slower robot would tip over [s]."""
 SETTLE_S = 1.0
 """Time for which joints are braked before the program releases the robot [s]."""
 

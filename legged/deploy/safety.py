@@ -11,7 +11,7 @@ from legged.deploy.policy import gravity_in
 SLOWEST_FALL = 0.5
 """Speed at which braking takes the whole torque of a joint, as a share of the joint's largest speed."""
 AT_ONCE = 2.0
-"""Factor on the allowed joint speed above which the robot is stopped at once."""
+"""Multiple of the allowed joint speed above which the robot is stopped at once."""
 MOST_DAMPING = 4.0
 """Largest D gain for braking, as a multiple of the policy's D gain, because motors may be unstable far above that gain."""
 
@@ -108,8 +108,8 @@ class Watch:
 
 
 def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.ndarray, contract: Contract) -> np.ndarray:
-    """Return the targets (D,) [rad] after clipping to the position limits, and then so that |kp (target - q) - kd dq| is
-    within the torque limits. Where both are not possible, the torque limits take precedence.
+    """Return targets (D,) [rad] that are clipped to the position limits, and then to the range in which the torque
+    kp (target - q) - kd dq stays within the torque limits. Where the two conflict, the torque limits count.
     """
     kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
     inside = np.clip(targets, *contract.position_limits.T)

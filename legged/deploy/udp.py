@@ -1,4 +1,4 @@
-"""A robot that is reached by UDP, and its packets. It is a simulator in another process, or a bridge to a real robot.
+"""A robot that is reached by UDP, and its packets. The robot is a simulator in another process, or a bridge to a real robot.
 
 A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program begins the handshake
 with HELLO and the sources that it needs, and the robot answers with FACTS, both as JSON. Then the robot sends states to the
@@ -28,7 +28,7 @@ STATE_HEAD = struct.Struct("<dHHB")
 """Head of a state: time [s], D, flags, number of sources. Float32 w, x, y, z, gyro (3), q (D), dq (D) and torques (D) follow,
 and for each source its name (length as a byte, ASCII) and its numbers (count as uint16, float32)."""
 COMMAND_HEAD = struct.Struct("<IH")
-"""Head of a command: sequence number of the answered state, D. Float32 targets, P gains and D gains (D each) follow."""
+"""Head of a command: sequence number of the state it answers, D. Float32 targets, P gains and D gains (D each) follow."""
 LARGEST = 60_000
 """Largest size of a packet [bytes]."""
 ANSWER_S = 10.0
@@ -37,7 +37,7 @@ ASK_EVERY_S = 0.1
 SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
 """Linux's socket option for arrival times of packets, on the clock of `time.time`, and the type of the message with them."""
 MOMENT = struct.Struct("@ll")
-"""Seconds and microseconds."""
+"""Arrival time in this message: seconds and microseconds."""
 SET_S = 0.01
 """Change of the difference between `perf_counter` and `time` above which the time of day counts as reset [s]."""
 SOURCE_AGE_S = 0.2
@@ -212,7 +212,7 @@ class UdpRobot(Interface):
 
     def _received(self, kind: int) -> list[tuple[int, bytes, float]]:
         """Return the new packets of a kind: their numbers, bodies and times of arrival, as `time.perf_counter` [s]. If the
-        time of day was set in between, the present time replaces the times of arrival.
+        time of day was set since the last call, the present time replaces the times of arrival.
         """
         found: list[tuple[int, bytes, float]] = []
         now, behind = time.perf_counter(), time.perf_counter() - time.time()

@@ -79,7 +79,7 @@ BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 """Byte -> the byte with its bits in reverse order."""
 SELECT, L2, B = (2, 3), (2, 5), (3, 1)
 """Keys of the remote control: byte of `wireless_remote` and bit in it."""
-# Lowest and highest angle [rad], largest velocity [rad/s] and torque [N m] by joint, as Unitree's models have them.
+# Lowest and highest angle [rad], largest velocity [rad/s] and torque [N m] of each joint, from Unitree's models.
 _GO2_LEG = {"hip": (-1.0472, 1.0472, 30.1, 23.7), "calf": (-2.7227, -0.83776, 20.07, 35.55)}
 _GO2_THIGH = {"F": (-1.5708, 3.4907, 30.1, 23.7), "R": (-0.5236, 4.5379, 30.1, 23.7)}
 _GO2 = {
@@ -150,7 +150,7 @@ KINDS = {
 
 
 def crc(message: bytes) -> int:
-    """Return the checksum of a message, which belongs into its last four bytes.
+    """Return the checksum for the last four bytes of a message.
 
     zlib computes the reflected CRC of the same polynomial, so the bits of input and output are reversed.
     """
@@ -162,7 +162,7 @@ def crc(message: bytes) -> int:
 def command_of(
     kind: UnitreeKind, mode_machine: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return a command, a record (), with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Target
+    """Return a command as a NumPy record, with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Target
     velocities and feedforward torques are zero, and all other motors are off. `mode_machine` is the value in G1's state.
     """
     message, places = np.zeros((), kind.command), list(kind.motors)
@@ -254,7 +254,7 @@ class SdkWire:
         """Send a LowCmd_.
 
         Raises:
-            RunError: it was not sent.
+            RunError: the command was not sent.
         """
         if self._publisher.Write(command) is False:  # the SDK returns False, it raises nothing
             raise RunError("--robot: Unitree's SDK could not send a command")
@@ -287,7 +287,7 @@ class UnitreeRobot(Interface):
             wire.listen(self._hear)
             if not self._first.wait(FIRST_STATE_S):
                 raise RunError(
-                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; check that it is on, and check --network"
+                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; check that the robot is on, and --network"
                 )
             if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
                 raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")

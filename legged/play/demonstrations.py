@@ -22,7 +22,7 @@ SCHEDULE = (  # (seconds, (vx, vy [m/s], yaw rate [rad/s]))
     (1.5, (0.0, 0.0, -0.8)),
     (1.5, (0.0, 0.0, 0.0)),
 )
-"""Times and commands of the demonstration; commands are clipped to the ranges of the training."""
+"""Durations and commands of the demonstration; commands are clipped to the ranges of the training."""
 SETTLE_S = 1.0
 """Time after the start of a command, and after a fall, in which errors are not measured [s]."""
 FORWARD = 0.7

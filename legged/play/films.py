@@ -1,4 +1,4 @@
-"""Films as MP4, GIF or PNG: of `play`, with text in the frames, and of a robot that walks straight ahead."""
+"""Films of `play`, with text in the frames (MP4, GIF), and films of a robot that walks straight ahead (GIF, PNG)."""
 
 import errno
 import subprocess
@@ -26,7 +26,7 @@ PLAY_FPS = 25
 GIF_FPS, GIF_S, GIF_SIZE = 8, 12.0, (416, 234)
 """Frames per second, length [s], and width and height [pixels] of a GIF of `play`."""
 FPS = 12.5
-"""Pictures per second of a walk. In a GIF each picture lasts a whole number of hundredths of a second, here 8."""
+"""Pictures per second of the film of a walk. In a GIF each picture lasts a whole number of hundredths of a second, here 8."""
 FILM_S, WARM_UP_S = 4.0, 2.0
 """Length of the film of a walk, and time for which the robot walks before the film begins [s]."""
 SPEED = 0.6
@@ -175,7 +175,7 @@ def write_mp4(frames: Film, path: Path, fps: float) -> None:
     wanted = ["-an", "-codec:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
     with replacing(path) as part:
         command = [program, "-y", "-loglevel", "error", *given, *wanted, str(part)]
-        # Through a pipe ffmpeg would not report a full disk; its exit code does.
+        # ffmpeg reports a full disk by its exit code and its error output.
         done = subprocess.run(command, input=np.stack(frames).tobytes(), capture_output=True, check=False)
         if done.returncode:
             said = done.stderr.decode("utf-8", errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]

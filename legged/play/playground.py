@@ -15,7 +15,7 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terr
 DIFFICULTIES = (0.5, 0.8)
 """Default difficulties of the tiles on which robots start, and of the tiles behind them."""
 COLUMNS = 4
-"""Number of tiles side by side if a single type is chosen; tiles of random types differ from each other."""
+"""Number of tiles side by side if a single type is chosen. Tiles of types with random shapes differ from each other."""
 SETTING: tuple[tuple[str, Any], ...] = (
     ("terrain.border_size", 3.0),
     ("terrain.spawn_range", 0.3),
@@ -30,8 +30,8 @@ ROWS_NEEDED = 128
 
 @dataclass(frozen=True)
 class Playground:
-    """Two rows of tiles, each column of one type. Robots start in the middle of tiles in the first row and walk along x into
-    the second row.
+    """Two rows of tiles, with one terrain type in each column. Robots start in the middle of a tile in the first row and walk
+    along x into the second row.
     """
 
     rows: tuple[tuple[TileSpec, ...], tuple[TileSpec, ...]]
@@ -41,7 +41,7 @@ class Playground:
     @classmethod
     def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
         """Return the playground for --terrain (`name`) and --difficulty: COLUMNS columns of the type `name` or, with no name,
-        a column for each type of the task. Return None without a name for a task on a plane.
+        a column for each type of the task. Without a name, return None for a task on a plane.
 
         Raises:
             ConfigError: the type or the difficulty does not exist.
@@ -63,7 +63,7 @@ class Playground:
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
 
         def size(kind: str, usual: float) -> float:
-            """Return the size of a tile at the given difficulty, or at the `usual` one in the training's terrain."""
+            """Return the size of a tile at `difficulty`, or if that is None, at the difficulty `usual` of the training."""
             if difficulty is None:
                 return tile_size(cfg.terrain, kind, usual)
             return TERRAIN_TYPES[kind].sized(difficulty, cfg.terrain.scale)
@@ -87,7 +87,7 @@ class Playground:
         ]
 
     def build(self, cfg: LeggedConfig) -> Terrain:
-        """Return the terrain with the tile size of `cfg`, a configuration with the overrides of `changes`.
+        """Return the terrain. `cfg` is the configuration with the overrides of `changes`; it sets the length of a tile.
 
         Raises:
             ConfigError: the tiles are too small.
@@ -96,7 +96,7 @@ class Playground:
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:
-        """Return the column of each robot. All robots are moved on by `shift` places in `order`."""
+        """Return the column index of each robot. `shift` moves all robots on by so many places in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
     def place(self, task: LeggedRobot, shift: int = 0) -> None:
@@ -112,7 +112,7 @@ class Playground:
         return label(self.rows[row][column].type, [self.rows[row][column].size])
 
     def labels(self) -> dict[str, str]:
-        """Return terrain type -> the text of `label` with the sizes of its tiles."""
+        """Return terrain type -> text of the function `label`, with the sizes of all tiles of the type."""
         sizes: dict[str, dict[float, None]] = {}  # an ordered set of sizes for each type
         for spec in (*self.rows[0], *self.rows[1]):
             sizes.setdefault(spec.type, {})[spec.size] = None

@@ -20,7 +20,7 @@ HELP_WITHOUT_COMMANDS = "viewer: backspace starts anew; close the window to reco
 
 
 class Keyboard:
-    """A command vx, vy [m/s], yaw rate [rad/s] within the ranges of the task, which key presses change."""
+    """Command of vx, vy [m/s] and yaw rate [rad/s]. Key presses change it within the ranges of the task."""
 
     MOVES = {UP: (0, 1), DOWN: (0, -1), COMMA: (1, 1), PERIOD: (1, -1), LEFT: (2, 1), RIGHT: (2, -1)}
 
@@ -47,7 +47,7 @@ class Keyboard:
 
 @torch.inference_mode()
 def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> None:
-    """Show the task's first environment in real time until the window is closed, on the `playground` if one is given."""
+    """Show the task's first environment, on the `playground` if one is given, in real time until the window is closed."""
     import mujoco.viewer  # imported here, because a machine without a display may lack a library
 
     legged = task if isinstance(task, LeggedRobot) else None

@@ -21,7 +21,7 @@ LAWS = {
     "V": "stiffness * (action_scale * action - dq) - damping * ddq, ddq over one sim_dt",
     "T": "action_scale * action",
 }
-"""Law of a joint -> torque [N m] at joint angle q [rad] and velocity dq [rad/s]; action clipped at action_clip."""
+"""Law of a joint -> formula of its torque [N m] from joint angle q [rad], velocity dq [rad/s] and the clipped action."""
 SHARED = {
     "observation": "for each term clip(scale * value, -observation_clip, observation_clip), at its columns start to"
     " start + size, without noise",
@@ -42,7 +42,7 @@ FRAMES = ("base frame", "yaw frame", "world frame")
 
 def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any]:
     """Return the observation layout with units, frames and formulas, the joints, the control law and time steps. Keys are
-    never renamed. The noise comes from `trained`, the configuration of the training, or else from the task's.
+    never renamed. The noise comes from `trained`, the configuration of the training, or else from that of the task.
     """
     cfg = task.cfg
     groups: list[dict[str, Any]] = []
@@ -69,7 +69,7 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
 
 
 def describe_robot(task: LeggedRobot) -> dict[str, Any]:
-    """Return the joints of a task's robot, its command ranges and its control law."""
+    """Return the joints of a task's robot, the command ranges and the control law."""
     cfg, robot, control = task.cfg, task.robot, task.control
     low, high = task.command_sampler.full_ranges.t().tolist()
     scale, bent = control.action_scale, crouch(robot)
@@ -146,8 +146,8 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
 
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:
-    """Return one observation term, with the half width of its noise. The unit is that of the mark `@unit`; frame and formula
-    come from the method's docstring.
+    """Return the description of an observation term. `noise` is the half width of its noise. `@unit` declares the unit; frame
+    and formula come from the docstring of the term's method.
     """
     method = getattr(type(task), f"_obs_{term.name}")
     text = " ".join((inspect.getdoc(method) or "").partition("\n\n")[0].split())
@@ -189,7 +189,7 @@ def describe_estimator(task: BaseTask) -> dict[str, Any]:
 
 
 def describe_memory(task: BaseTask) -> dict[str, Any] | None:
-    """Return the hidden state of a recurrent policy and its use; None for a policy without memory."""
+    """Return names and shape of a recurrent policy's hidden state, and its use; None for a policy without memory."""
     policy = task.cfg.train.policy
     if policy.rnn_type == "none":
         return None

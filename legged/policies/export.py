@@ -27,18 +27,18 @@ from legged.policies.description import describe
 from legged.process.paths import make_folder, write_bytes, write_text
 
 EXPORTED = "exported"
-"""Folder of the exported files, inside that of a film or a checkpoint."""
+"""Folder of the exported files, inside the folder of a film or a checkpoint."""
 CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
 """Numbers of steps and robots with which the export of a recurrent policy is checked."""
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
 """Pairs of step and robot at which an episode begins during that check."""
 LARGEST_DIFFERENCE = 1e-4
-"""Largest allowed difference between an export and the policy, in actions or relative to the largest action."""
+"""Largest allowed difference of an exported action from the policy's, relative to the largest action if that is above 1."""
 
 
 class ExportError(RunError):
-    """Error that the actions of an exported file differ from the policy's."""
+    """Failure of an export: the actions of an exported file differ from the policy's."""
 
 
 def export(
@@ -51,11 +51,11 @@ def export(
     """Write `policy`, rsl-rl's actor network, to `folder` as policy.pt (TorchScript), policy.onnx and policy.weights (plain
     numbers, legged.deploy.weights); return the largest difference of each file's actions from the policy's.
 
-    All map a flat observation (batch, width) to actions (batch, joints), without noise. The observation has the policy's
-    groups side by side; a group with a history of H steps has H observations, oldest first. The TorchScript of a recurrent
-    policy keeps the hidden state for a batch of 1 until its reset(); the ONNX has it as inputs and outputs. The metadata,
-    with the entries of `training`, is in the ONNX file and in policy.json, which also has the files' checksums. `trained` is
-    the configuration of the training if it is not the task's. A network of the motors is copied to the folder.
+    All files map a flat observation (batch, width) to actions (batch, joints), without noise. The observation has the
+    policy's groups side by side; a group with a history of H steps has H observations, oldest first. The TorchScript of a
+    recurrent policy keeps the hidden state for a batch of 1 until its reset(); the ONNX has it as inputs and outputs. The
+    ONNX file and policy.json have the metadata, including `training`; policy.json also has the files' checksums. `trained` is
+    the configuration of the training if it differs from the task's. A learned actuator's network is copied to the folder.
 
     Raises:
         ExportError: the actions of a file differ from the policy's.
@@ -174,13 +174,13 @@ def _torchscript(policy: Any) -> bytes:
 
 
 def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
-    """Return the file of rsl-rl's ONNX model with a free batch size and the metadata as JSON strings, one per key."""
+    """Return the ONNX file of a policy. The batch size is free, and each key of `metadata` has its value as JSON."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
     buffer = io.BytesIO()
     inputs, outputs = module.input_names, module.output_names
     hidden = {name: {1: "batch"} for name in (*inputs[1:], *outputs[1:])}
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # checks of shapes
+        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # caused by checks of shapes
         warnings.filterwarnings("ignore", message="Exporting a model to ONNX with a batch_size other than 1")
         torch.onnx.export(
             module,
@@ -200,7 +200,7 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
 
 def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
     """Return the file of weights of `policy`, rsl-rl's actor network on the CPU. `activation` is rsl-rl's name for the
-    activation of hidden layers. Of the outputs only the means of the actions are kept.
+    activation of hidden layers. Only those outputs that are means of the actions are kept.
     """
     layers: list[Layer] = []
     if policy.obs_normalization:
@@ -230,7 +230,7 @@ def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> l
 
 
 def _recurrent(module: nn.LSTM | nn.GRU) -> list[Layer]:
-    """Return the layers of a recurrent module, the first one first."""
+    """Return the layers of a recurrent module in order."""
     kind, layers = kinds.LSTM if isinstance(module, nn.LSTM) else kinds.GRU, []
     for i in range(module.num_layers):
         names = (f"weight_ih_l{i}", f"weight_hh_l{i}", f"bias_ih_l{i}", f"bias_hh_l{i}")

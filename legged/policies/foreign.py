@@ -38,13 +38,13 @@ TERMS = {
 }
 """Terms of which an observation may consist."""
 COMMANDS = ("command_xy", "command_yaw")
-"""Names in layouts for the first two columns and the third column of the term `commands` of policy.json."""
+"""Terms of a layout that split the term `commands` of policy.json: its first two columns, and its third column."""
 JOINTS, STIFFNESS, DAMPING = (
     ("dof_names", "joint_names"),
     ("kp", "stiffness", "joint_stiffness"),
     ("kd", "damping", "joint_damping"),
 )
-"""Keys of an ONNX file's metadata for its joints, in the order of the network, and for their P and D gains."""
+"""Possible keys in an ONNX file's metadata: of the joints in the network's order, of P gains, and of D gains."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Layout:
     action_scale: float | dict[str, float] = field(default=0.25, metadata=positive(LARGEST))
     """Target = action_scale * action + default angle [rad]; one number, or joint-name pattern -> number."""
     action_clip: float = field(default=100.0, metadata=positive(LARGEST))
-    """Largest action."""
+    """Absolute value at which actions are clipped."""
     joints: tuple[str, ...] = ()
     """Joints in the policy's order; empty takes the joints that the ONNX file names, or else the robot's."""
     action_joints: tuple[str, ...] = ()
@@ -71,15 +71,15 @@ class Layout:
     torque_limits: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest torque [N m]; empty takes the robot's."""
     implicit_gains: bool = False
-    """Gains belong to MuJoCo's position actuators and its implicitfast integrator, not to an explicit control law."""
+    """True if the gains are those of MuJoCo's position actuators with the integrator implicitfast, not of an explicit law."""
     observation_clip: float = field(default=LARGEST, metadata=positive(LARGEST))
-    """Scaled observations are clipped at plus and minus this."""
+    """Absolute value at which scaled observations are clipped."""
     velocity_point: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=between(-100, 100))
-    """Point of the base, such as the place of its IMU, whose velocity the term `base_lin_vel` gives; base frame [m]."""
+    """Point whose velocity the term `base_lin_vel` gives, such as the place of the IMU; base frame [m]."""
     phase_offsets: tuple[float, ...] = field(default=(0.0,), metadata=items(16, between(-100, 100)))
     """Phase of each clock at the start [rad]."""
     phase_period_s: float = field(default=1.0, metadata=positive(1000))
-    """Length of a clock's turn [s]."""
+    """Period of a clock [s]."""
     phase_standing: float | None = field(default=None, metadata=between(-100, 100))
     """Phase of all clocks while the command is zero [rad]; null lets them run on."""
     control_dt: float = field(default=0.02, metadata=positive(1.0, low=1e-3))
@@ -121,7 +121,7 @@ def _layout_of(contract: Contract) -> Layout:
     """Return the layout of an exported policy, which must observe a single step, with one scale for each term."""
     path = contract.path
     if contract.states or any(group.history != 1 for group in contract.groups):
-        raise ConfigError(f"{path}: the policy has a memory or a history; only policies without both can be played here")
+        raise ConfigError(f"{path}: the policy has a memory or a history; only policies with neither can be played here")
     observation: dict[str, float] = {}
     for term in contract.terms:
         halves = dict(zip(COMMANDS, (term.scale[:2], term.scale[2:]), strict=True))
@@ -154,8 +154,8 @@ def _layout_of(contract: Contract) -> Layout:
 
 
 def was_trained_with_other_motors(contract: Contract) -> bool:
-    """Return whether a policy was trained with motors that no layout describes: control.actuator with a torque-speed line,
-    friction, a delay, a learned law or rotor inertia.
+    """Return whether a policy was trained with motors that a layout cannot describe: with a torque-speed line, friction, a
+    delay, a learned actuator or rotor inertia (control.actuator).
 
     Raises:
         ConfigError: the contract's section about the actuator is invalid.
@@ -171,8 +171,8 @@ class ForeignPolicy:
         """Load the ONNX file at `path`; its metadata, texts by name, are in `metadata`.
 
         Raises:
-            ConfigError: it cannot be read, its joints are not the robot's, its sizes are not the layout's, its actions are
-                not finite, or the layout is the contract of another export.
+            ConfigError: the file cannot be read, its joints are not the robot's, its sizes are not the layout's, its actions
+                are not finite, or the layout is the contract of another export.
         """
         self.layout, self._path, self._session = layout, path, open_onnx(path)
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
@@ -184,7 +184,7 @@ class ForeignPolicy:
             if name not in names:
                 raise ConfigError(f"{path}: robot '{robot.name}' has no joint '{name}'{suggest(str(name), names)}")
         if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
-            raise ConfigError(f"{path}: it names {len(set(joints))} joints, '{robot.name}' has {robot.num_dof}")
+            raise ConfigError(f"{path}: it names {len(set(joints))} joints, but '{robot.name}' has {robot.num_dof}")
         acted = list(layout.action_joints) or joints
         if len(set(acted)) != len(acted):
             raise ConfigError(f"{path}: action_joints: names a joint twice")
@@ -238,10 +238,10 @@ class ForeignPolicy:
         zeros = np.zeros(3)
         width = len(self._observe(zeros, zeros, zeros, zeros, self.default, self.default))
         if isinstance(inputs[0].shape[1], int) and inputs[0].shape[1] != width:
-            raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, the layout's observation has {width}")
+            raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, but the layout's observation has {width}")
         count = len(self._acted)
         if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != count:
-            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, '{robot.name}' has {count} joints")
+            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, but {count} joints take one")
 
     def reset(self) -> None:
         """Start an episode."""

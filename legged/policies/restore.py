@@ -1,4 +1,4 @@
-"""Finding a trained policy and putting it back into its task."""
+"""Search for a trained policy, and reconstruction of its task and its actor network."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -68,7 +68,7 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
 
 
 def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return a configuration for measurements with the nominal model, randomised only by `changes`.
+    """Return the configuration for measurements: the nominal model, without randomisation except by `changes`.
 
     Raises:
         ConfigError: the changes do not fit the configuration.

@@ -14,7 +14,7 @@ Argument = Callable[[argparse.ArgumentParser], object]
 """A function that adds an argument to a parser."""
 
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
-"""Negative numbers, which look like options. Before Python 3.14 argparse does not know -1e-1."""
+"""Pattern of negative numbers, which look like options. Before Python 3.14 argparse takes -1e-1 for an option."""
 OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
 """Options of legged_gym, which may also be written with underscores."""
 
@@ -23,9 +23,7 @@ class CommandParser(argparse.ArgumentParser):
     """Parser of one command's arguments, whose help ends with examples."""
 
     def __init__(self, prog: str, description: str | None, *examples: str, arguments: Iterable[Argument] = ()) -> None:
-        """Take the words that call the command, its description, at least two examples as complete command lines, and its
-        arguments.
-        """
+        """Build the parser. `prog` is the words that call the command; `examples` are two or more complete command lines."""
         self.examples = examples
         """Command lines that this parser can parse."""
         shown = "\n".join(["examples:", *(f"  {example}" for example in examples)])
@@ -49,12 +47,12 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class Once(argparse.Action):
-    """Option that may be given once. argparse would silently use the last of several."""
+    """Option that may be given once. If it were given twice, argparse would silently use the last value."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: Any = None
     ) -> None:
-        """Store the value, or end the program if there is one already."""
+        """Store the value, or end the program if the option was given before."""
         before = getattr(namespace, self.dest)
         if before is not None:
             parser.error(f"{option}: is given twice, {before} and {values}; write {option} {before},{values}")
@@ -62,7 +60,7 @@ class Once(argparse.Action):
 
 
 def argument(*names: str, **options: Any) -> Argument:
-    """Return an argument with the names and options of `add_argument`."""
+    """Return an argument. Names and options are those of argparse's `add_argument`."""
     return lambda parser: parser.add_argument(*names, **options)
 
 

@@ -44,15 +44,15 @@ class DeferredCompiler(ModuleType):
         self.assume_constant_result = partial(self._mark, "assume_constant_result")
 
     def _mark(self, name: str, function: Any) -> Any:
-        """Record that a function is to be traced as one piece, or that it always returns the same value."""
+        """Mark a function by the compiler's function `name`. The stand-in only records the mark, for the real module."""
         if not self.stands:
             return getattr(self.real(), name)(function)
         self._marks.append((name, function))
         return function
 
     def disable(self, function: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Return the function unchanged if torch's own wrapper calls, which does so once and keeps the result. Pass any other
-        call on to the real module.
+        """Return the function unchanged if the caller is torch's own wrapper, which calls once and keeps the result. Pass any
+        other call on to the real module.
         """
         if self.stands and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
             self._not_disabled.append(function)
@@ -78,7 +78,7 @@ class DeferredCompiler(ModuleType):
         for name, function in self._marks:
             getattr(real, name)(function)
         for function in self._not_disabled:
-            vars(function).pop("__dynamo_disable", None)  # torch's wrapper then asks the real module
+            vars(function).pop("__dynamo_disable", None)  # without the kept result, torch's wrapper asks the real module
         return real
 
     @property

@@ -15,7 +15,7 @@ from legged.errors import ConfigError, suggest
 from legged.process.startup import command_of_ours
 
 NO_PICTURES = ""
-"""Reason why nothing can be drawn in this process, if MuJoCo failed to draw with the library that MUJOCO_GL names."""
+"""Reason why this process cannot draw: the library that MUJOCO_GL names does not work. Empty if it works."""
 ANSWER_S = 0.5
 """Time after which a display that does not answer counts as missing [s]."""
 OFF = ("disable", "disabled", "off", "false", "0")
@@ -27,7 +27,7 @@ ON = ("", "enable", "enabled", "on", "true", "1")
 
 
 def display_answers() -> bool:
-    """Return True if a display of this machine accepts connections; DISPLAY may name one that no longer exists."""
+    """Return True if a display accepts connections. DISPLAY alone is no proof: it may name one that no longer exists."""
     if sys.platform != "linux":
         return True
     wayland = os.environ.get("WAYLAND_DISPLAY")
@@ -72,9 +72,9 @@ def off_screen_library() -> str | None:
 
 
 def choose() -> None:
-    """Set MUJOCO_GL on a machine without a display, unless the user has set it; check the user's value. If the user's
-    library is missing, MuJoCo could not be imported. So pictures are switched off with a warning, because most commands
-    draw nothing.
+    """Set MUJOCO_GL on a machine without a display. If the user has set it, check its value instead. If the library that it
+    names is missing, switch off pictures with a warning: otherwise MuJoCo could not be imported, and most commands draw
+    nothing.
 
     Raises:
         ConfigError: MuJoCo does not know the value of MUJOCO_GL.
@@ -91,7 +91,7 @@ def choose() -> None:
     try:
         context = import_module(CONTEXT)
         if value not in OFF and context.GLContext.__module__ == CONTEXT:
-            context.GLContext()  # MuJoCo's placeholder for a missing library raises an error with its name
+            context.GLContext()  # for a missing library, MuJoCo has a placeholder that raises an error
     except Exception as error:  # each library fails in its own way
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
             return  # a robot's computer needs no MuJoCo, because it draws nothing

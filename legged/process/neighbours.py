@@ -15,21 +15,21 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts. The locks that it tries would otherwise look like trainings."""
+"""File that a process locks while it counts. Without it, two counting processes would take each other for trainings."""
 PAUSE_S = 1.0
 """Shortest time between two counts during a training [s]."""
 
 
 class Neighbours:
-    """The other trainings on one device, of all users. In its context the others can see this training.
+    """Counter of the other trainings on a device, of all users. Inside its `with` block the others can see this training.
 
     The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a
     container with separate temporary files, are not seen.
     """
 
     def __init__(self, device: str) -> None:
-        """Take the unique name of the `device` on this machine, such as a GPU's UUID. An index would not
-        do, because processes may number the devices differently.
+        """Create the counter. `device` is a name that is unique on this machine, such as a GPU's UUID. An index is not
+        unique, because processes may number the devices differently.
         """
         self.most = 0
         """Largest number of other trainings seen at one time."""
@@ -50,7 +50,7 @@ class Neighbours:
             self._lock = os.fdopen(descriptor, "wb")
             os.chmod(name, 0o644)
             lock_descriptor(descriptor, blocking=False)
-            self._path = Path(name).rename(f"{name}{ENDING}")  # locked before another process sees the file
+            self._path = Path(name).rename(f"{name}{ENDING}")  # others look for this ending; the file is already locked
         self.look()
         return self
 
@@ -61,7 +61,7 @@ class Neighbours:
             self._lock.close()
 
     def glance(self) -> None:
-        """Count the others, unless the last count was a moment ago."""
+        """Count the others, unless the last count was less than PAUSE_S ago."""
         if time.monotonic() - self._looked_s >= PAUSE_S:
             self.look()
 

@@ -46,7 +46,7 @@ def relative(path: Path) -> str:
 
 
 def exists(path: Path) -> bool:
-    """Return True if the file or folder exists. A name that the system rejects does not exist."""
+    """Return True if the file or folder exists. Return False for names that the system rejects."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -59,8 +59,8 @@ def reason(error: OSError) -> str:
 
 
 def full_disk_in(error: BaseException) -> OSError | None:
-    """Return the error of a full disk in the chain of causes of `error`, or None. A library may have raised
-    another error because of it.
+    """Return the error of a full disk if it is `error` or one of its causes, else None. A library may have raised `error`
+    because of a full disk.
     """
     found: BaseException | None = error
     while found is not None:
@@ -72,8 +72,8 @@ def full_disk_in(error: BaseException) -> OSError | None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary file next to `path`, with the same ending and a name unique to this process. It replaces `path` after
-    the block, or is removed if the block fails.
+    """Provide a temporary file next to `path`, with the same ending and a name unique to this process. After the block the
+    file replaces `path`, or is removed if the block fails.
 
     Raises:
         RunError: the file can't be written: the disk is full or read-only, or the folder belongs to another user.

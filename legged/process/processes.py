@@ -17,7 +17,7 @@ INSTALLED = ("site-packages", "dist-packages")
 """Names of folders with installed packages."""
 POLL_S = 0.05
 PATIENCE_S = 10.0
-"""Time that a process has to end after a signal [s]."""
+"""Time in which a process must end after a signal [s]."""
 BUILT = "step captured"
 """Last stage of a training's start-up that keeps the cores busy."""
 
@@ -34,7 +34,7 @@ def child_environment() -> dict[str, str]:
 
 
 class Kind(Enum):
-    """Resource that a process needs."""
+    """Kind of work of a process. Each kind has a limit on how many processes run at once."""
 
     TRAINING = "training"
     ON_GPU = "evaluation on the GPU"
@@ -90,7 +90,7 @@ class WorkerPool:
     """
 
     def __init__(self, room: dict[Kind, int], shared: tuple[Kind, ...] = ()) -> None:
-        """Take the number of jobs of each kind that run at once, and the kinds that wait for all trainings."""
+        """Build a pool. `room` is the largest number of running jobs of each kind; `shared` kinds wait for all trainings."""
         self.room, self.shared = room, shared
         self.waiting: list[Job] = []
         self.running: list[Job] = []

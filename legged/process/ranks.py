@@ -13,7 +13,7 @@ class Ranks:
     rank: int = 0
     """Number of this process. Process 0 logs, prints and saves."""
     local_rank: int = 0
-    """Number of this process on its machine, which is also the number of its GPU."""
+    """Number of this process among those on its machine; also the number of its GPU."""
     count: int = 1
     """Number of processes."""
     local_count: int = 1
@@ -32,7 +32,7 @@ class Ranks:
             return cls()
         for name, value, end in (("RANK", rank, count), ("LOCAL_RANK", local_rank, local_count)):
             if value >= end:
-                raise ConfigError(f"{name}: must be below {end}, the number of processes, got {value}; torchrun sets it")
+                raise ConfigError(f"{name}: must be below {end}, the number of processes, got {value}; torchrun sets {name}")
         return cls(rank, local_rank, count, local_count)
 
     @property

@@ -40,8 +40,8 @@ def stage_ended(name: str) -> None:
 
 @contextmanager
 def importing() -> Iterator[None]:
-    """Switch off garbage collection in the block, which imports modules or makes other objects that stay until the process
-    ends. Imports make a million objects, and repeated passes over these objects take a quarter of a start.
+    """Switch off garbage collection in a block that imports modules or makes other objects that stay until the process ends.
+    Imports make a million objects, and repeated passes over them would take a quarter of the start-up time.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -63,7 +63,7 @@ def is_a_command() -> None:
 
 def command_of_ours() -> str | None:
     """Return how this process was started as a command of this package: 'script' (train.py, play.py), 'module' (python -m
-    legged), 'installed' (legged), or None if it is not one.
+    legged), 'installed' (legged), or None for other processes.
 
     A multiprocessing child of a command is not a command, although Python gives it the same arguments.
     """

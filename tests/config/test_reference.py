@@ -63,7 +63,7 @@ def test_every_field_has_a_meaning_and_a_default_that_is_accepted():
         ("control.action_scale", ("a number or a map: a number for each name", 0.5, "rad", "above 0, at most 1e+06")),
         ("domain_rand.added_mass_range", ("[low, high]: 2 numbers", [-5.0, 5.0], "kg", "at most 10000 in size")),
         ("evaluation.yaw", ("a list of 3 numbers", [-1.0, 1.0, 0.5], "rad/s", "at most 20 in size")),
-        ("terminations.time_outs", ("a list: text each", ["left_terrain"], "", "0 to 1000 items, none twice")),
+        ("terminations.time_outs", ("a list: text each", ["left_terrain"], "", "0 to 1000 items, without duplicates")),
         ("train.runner.run_name", ("text", "", "", "a name that a folder can have")),
     ],
 )

@@ -82,7 +82,7 @@ def test_two_old_knobs_are_one_now(sim, step):
     ("sim", "text"),
     [
         ({"constraint_solver": "rounds", "smooth_dynamics": "fused"}, "now means sim.step=fused, but sim.step is 'library'"),
-        ({"constraint_solver": "fast"}, "replaced by sim.step: auto, fused or library; got 'fast'"),
+        ({"constraint_solver": "fast"}, "replaced by sim.step, which can be auto, fused or library; got 'fast'"),
         ({"constraint_solver": ["rounds"]}, "replaced by sim.step"),
     ],
 )

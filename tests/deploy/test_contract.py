@@ -79,7 +79,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
     [
         (
             {"contract_version": None},
-            r"contract_version: got none: an older version .* export the policy again \(legged play",
+            r"contract_version: got none, because an older version .* export the policy again \(legged play",
         ),
         ({"contract_version": 2}, r"contract_version: got 2; this program reads 1"),
         ({"control_type": "T"}, r"control_type: got 'T'; a robot takes joint angles"),
@@ -109,7 +109,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
         ({"default_joint_angles": [2.0] * 12}, r"default_joint_angles: must be within position_limits, got 2 at 'LF_HAA'"),
         (
             {"observation_groups": [{"name": "actor", "start": 0, "size": 46, "history": 2}]},
-            r"observation_groups: 'actor' has 46 numbers, its terms 45",
+            r"observation_groups: 'actor' has 46 numbers, but its terms have 45",
         ),
         (
             {"observation_groups": [{"name": "other", "start": 0, "size": 45, "history": 2}]},
@@ -127,7 +127,7 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
     [
         ({"name": "my_gyro"}, "'my_gyro' cannot be made from 'gyro'"),
         ({"needs": "quaternion"}, "'base_ang_vel' cannot be made from 'quaternion'"),
-        ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, a robot gives 3"),
+        ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, but a robot gives 3"),
         ({"start": 3}, "'base_ang_vel' must start at column 0, got 3"),
     ],
 )
@@ -159,11 +159,11 @@ def other_order(names):
             "joint_names: 'still' has a joint 'TAIL' that the policy does not know",
         ),
         ({"joint_names": other_order}, "joint 0 is 'LF_HAA' for the policy and 'LF_HFE' for 'still'; their orders differ"),
-        ({"torque_limits": lambda limits: limits * 0.9}, "trained with 80 N m at 'LF_HAA', 'still' has 72"),
-        ({"velocity_limits": lambda limits: limits - 1.0}, "trained with 20 rad/s at 'LF_HAA', 'still' has 19"),
-        ({"torque_limits": lambda limits: limits * np.nan}, "trained with 80 N m at 'LF_HAA', 'still' has nan"),
-        ({"position_limits": lambda limits: limits * 0.5}, "trained with -0.72 to 0.49 rad at 'LF_HAA', 'still' has -0.36"),
-        ({"imu_body": lambda _: "torso"}, "in the frame of 'base', the IMU of 'still' measures in that of 'torso'"),
+        ({"torque_limits": lambda limits: limits * 0.9}, "trained with 80 N m at 'LF_HAA', but 'still' has 72"),
+        ({"velocity_limits": lambda limits: limits - 1.0}, "trained with 20 rad/s at 'LF_HAA', but 'still' has 19"),
+        ({"torque_limits": lambda limits: limits * np.nan}, "trained with 80 N m at 'LF_HAA', but 'still' has nan"),
+        ({"position_limits": lambda limits: limits * 0.5}, "with -0.72 to 0.49 rad at 'LF_HAA', but 'still' has -0.36"),
+        ({"imu_body": lambda _: "torso"}, "in the frame of 'base', but the IMU of 'still' measures in that of 'torso'"),
     ],
 )
 def test_a_robot_that_does_not_fit_is_refused_by_name(contract, changes, says):
@@ -192,7 +192,7 @@ def test_files_of_two_exports_are_refused(folder, tmp_path):
     for key, value in (("action_scale", 0.25), ("stiffness", [90.5] * 12), ("damping", [3.0] * 12), ("control_dt", 0.01)):
         changed(folder, tmp_path, **{key: value})
         with pytest.raises(
-            ConfigError, match=rf"{key}: differs from that of .*policy\.onnx; the files are of different exports"
+            ConfigError, match=rf"{key}: differs from that of .*policy\.onnx; the files are from different exports"
         ):
             Policy(tmp_path)
 
@@ -241,7 +241,7 @@ def export_of(folder, tmp_path):
 def test_every_entry_is_compared_with_the_onnx_file(export_of, changes):
     (key,) = changes
     with pytest.raises(
-        ConfigError, match=rf"policy\.json: {key}: differs from that of .*policy\.onnx; the files are of different exports"
+        ConfigError, match=rf"policy\.json: {key}: differs from that of .*policy\.onnx; the files are from different exports"
     ):
         Policy(export_of(sha256=None, **changes))
 

@@ -1,12 +1,12 @@
-// Runs a policy.weights file that play.py has exported; what is in it: legged/deploy/weights.py.
+// Runs a policy.weights file that play.py has exported. legged/deploy/weights.py describes its format.
 //
 //   legged::Policy policy("policy.weights");
 //   std::vector<float> observation(policy.inputs()), actions(policy.outputs());
 //   policy.run(observation.data(), actions.data());   // once every control_dt of policy.json
-//   policy.restart();                                 // where an episode begins: a recurrent policy forgets
+//   policy.restart();                                 // at the start of an episode: clears the hidden state
 //
-// C++14, this header alone, for little-endian computers. After it has been built, run() allocates nothing. What the
-// observation is made of and what the actions mean is in policy.json.
+// Needs C++14 and a little-endian computer, but no other library. run() allocates no memory. policy.json describes the
+// observation and the actions.
 #pragma once
 
 #include <algorithm>
@@ -32,7 +32,7 @@ public:
         if (std::memcmp(magic, "LEGGEDW1", sizeof magic) != 0) throw std::runtime_error(path + ": is no policy.weights");
         std::uint32_t count = 0;
         read(file, path, &count, sizeof count);
-        std::size_t kept = 0;  // numbers that the next layer of the kind join finds
+        std::size_t kept = 0;  // number of values that the next JOIN layer gets
         for (std::uint32_t i = 0; i < count; ++i) {
             std::uint32_t head[4];
             read(file, path, head, sizeof head);
@@ -76,7 +76,7 @@ public:
     std::size_t inputs() const { return layers_.front().inputs; }
     std::size_t outputs() const { return layers_.back().outputs; }
 
-    // Forgets the past.
+    // Clears the hidden state of a recurrent policy.
     void restart() {
         for (Layer& layer : layers_) {
             std::fill(layer.hidden.begin(), layer.hidden.end(), 0.0f);
@@ -84,7 +84,7 @@ public:
         }
     }
 
-    // Makes outputs() actions of inputs() numbers.
+    // Computes outputs() actions from inputs() numbers of an observation.
     void run(const float* observation, float* actions) {
         std::copy(observation, observation + inputs(), x_.begin());
         for (Layer& layer : layers_) {
@@ -144,7 +144,7 @@ private:
     static double sigmoid(double x) { return 0.5 * (1.0 + std::tanh(0.5 * x)); }
     static double softplus(double x) { return x > 0.0 ? x + std::log1p(std::exp(-x)) : std::log1p(std::exp(x)); }
 
-    // In the order of ACTIVATIONS in weights.py.
+    // `which` is an index in ACTIVATIONS of weights.py.
     static double activate(std::uint32_t which, double x) {
         switch (which) {
             case 0: return x > 0.0 ? x : std::expm1(x);
@@ -161,7 +161,7 @@ private:
         }
     }
 
-    // One step of a recurrent layer, from x_ to its hidden state.
+    // Computes one step of a recurrent layer. Its input is x_; the result is in layer.hidden.
     void advance(Layer& layer) {
         const std::size_t m = layer.inputs, n = layer.outputs, rows = (layer.kind == lstm ? 4 : 3) * n;
         const float* of_input = layer.numbers.data();

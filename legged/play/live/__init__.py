@@ -1,1 +1,1 @@
-"""Live view of a policy in a browser: the simulation (`session`), the checkpoint (`source`) and the web page (`page`)."""
+"""Live view of a policy in a browser: the simulation (`session`), its `drawing` and `plots`, and the web page (`page`)."""

@@ -1,4 +1,4 @@
-"""Robots, arrows for velocities, and the ground in viser's scene. Meshes have a normal and a colour for each vertex."""
+"""Robots, arrows for velocities, and the ground in viser's scene. Meshes have a normal for each vertex."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ GLIDE = np.array([0.25, 0.25, 0.06])
 so that it shakes less with the robot's steps.
 """
 CUT = 2.0
-"""Distance above which the view jumps to the robot, which must have been moved to another place [m]."""
+"""Distance from the robot above which the view jumps to it, because the robot was moved to another place [m]."""
 ARROWS_EVERY = 3
 """Number of pictures after which the lengths of arrows are updated; their positions are updated in every picture."""
 VIEW = np.array([-1.75, -2.1, 1.15])
@@ -111,7 +111,7 @@ class Drawing:
             for robot in robots
         ]
         self._above, self._arrows = [], []
-        if isinstance(task, LeggedRobot):  # arrows in frames above the robots, which turn with their heading
+        if isinstance(task, LeggedRobot):  # each robot has arrows in a frame above it, which turns with its heading
             thick, nothing = 0.022 * self.length, np.full((2, 2, 3), HIDDEN, dtype=np.float32)
             heads = {"shaft_radius": thick, "head_radius": 2.2 * thick, "head_length": 4.0 * thick}
             colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)
@@ -180,7 +180,7 @@ def _light(color: str) -> np.ndarray:
 
 
 def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
-    """Return the visible shapes of each body of a model except the world, in the frame of the body [m]."""
+    """Return body id -> mesh of the body's visible shapes, in the frame of the body [m]. The world has no mesh."""
     parts: dict[int, list[Part]] = {}
     for geom in range(model.ngeom):
         body, material, rgba = int(model.geom_bodyid[geom]), int(model.geom_matid[geom]), model.geom_rgba[geom]
@@ -239,7 +239,7 @@ def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals
 
 
 def _joined(parts: list[Part]) -> trimesh.Trimesh:
-    """Return one mesh of several parts. Its colours are linear intensities, as glTF wants."""
+    """Return one mesh of several parts. Its colours are linear intensities, as glTF requires."""
     vertices, _, colors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     starts = np.cumsum([0, *(len(points) for points, _, _ in parts)])
     faces = np.concatenate([own + start for (_, own, _), start in zip(parts, starts, strict=False)])
@@ -250,8 +250,8 @@ def _joined(parts: list[Part]) -> trimesh.Trimesh:
 
 
 def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
-    """Return the surface of a terrain with which the C engine computes collisions, and level ground around it, world frame
-    [m]: tops and vertical faces of steps, and smooth tiles. Colours are those of films.
+    """Return a mesh of a terrain and of level ground around it, world frame [m]. It is the surface on which the C engine
+    computes collisions: steps with vertical faces, and smooth tiles. Colours are those of films.
     """
     scene = mujoco.MjSpec()
     add_painted_terrain(scene, terrain, checkered=True)
@@ -286,7 +286,7 @@ def _surface(model: mujoco.MjModel, geom: int) -> Part:
 
 
 def plane_mesh() -> trimesh.Trimesh:
-    """Return a square of the ground around the origin. Dark and light squares with sides of half the PERIOD show motion."""
+    """Return a square of level ground around the origin. Its checkerboard of dark and light cells makes motion visible."""
     light = np.array([209.0, 214.0, 219.0])
     squares = np.kron([[1.0, 0.94], [0.94, 1.0]], np.ones((128, 128)))[:, :, None] * light
     corners = HALF_PLANE * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])

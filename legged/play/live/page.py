@@ -24,9 +24,9 @@ INSTALL = "pip install 'legged[watch]'"
 PICTURES_S, PLOTS_S, LOOK_S = 1.0 / 30.0, 0.25, 1.0
 """Time between two pictures, two updates of the plots, and two checks for a newer checkpoint [s]."""
 IDLE_S = 0.1
-"""Time between two checks for visitors while the page has none; the simulation rests meanwhile [s]."""
+"""Time between two checks for visitors while the page has no visitors; the simulation rests meanwhile [s]."""
 SLOW = 0.9
-"""Pace below which the page shows a warning."""
+"""Share of the chosen speed below which the page shows a warning."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
 """Keys that change the command: letter, axis and sign of the change. Viser's camera uses other letters and the arrows."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
@@ -88,7 +88,7 @@ def load_viser() -> Any:
 
 class Page:
     """A web page that shows and controls a session. Viser runs callbacks in its own threads, so they only queue actions.
-    `run` and `do_what_was_asked` execute the actions in the thread of their caller.
+    `run` and `do_what_was_asked` execute the actions in the thread that calls them.
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
@@ -127,7 +127,7 @@ class Page:
     # ---- controls ----------------------------------------------------------------------------------------------------
 
     def _do(self, event: Callable[[Any], object], action: Callable[[], object]) -> None:
-        """Queue an action for `run` at each event of a control: its on_click, on_update or on_trigger."""
+        """Queue an action at each event of a control. `event` is the control's on_click, on_update or on_trigger."""
         event(lambda _: self._asked.put(action))
 
     def _add_controls(self) -> None:

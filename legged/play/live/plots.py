@@ -25,7 +25,7 @@ DASH = (5, 2)
 MOST_POINTS = 160
 """Largest number of points of a curve; more could not be told apart in the panel."""
 LARGEST = 6
-"""Number of the largest reward terms, which have their own curves."""
+"""Number of reward terms that have their own curves. These are the largest terms."""
 LEFT, RIGHT, X_AXIS, FRAME = 44, 12, 30, 10
 """Width of the vertical axis, right margin, height of the time axis, and viser's margin around a chart [pixels]."""
 SMALLEST_RANGE = 0.25
@@ -47,7 +47,7 @@ class History:
         """Rows: time, actual and commanded velocity (3 each), contacts (F), and rewards in the task's unit (terms)."""
 
     def add(self, task: BaseTask, robot: int, time: float) -> None:
-        """Add the last control step of one of a task's robots; the simulated `time` is in [s]."""
+        """Add the last control step of the robot with the index `robot`. `time` is the simulated time [s]."""
         row = np.full(7 + len(self.feet) + len(self.terms), np.nan)
         row[0] = time
         if not bool(task.reset_buf[robot]):
@@ -146,13 +146,13 @@ def _line(name: str, color: str, dash: tuple[int, int] | None = None) -> dict[st
 
 
 def _reward_lines(names: Sequence[str]) -> Lines:
-    """Return uPlot's options for reward curves; a curve after the LARGEST is the sum of the other terms."""
+    """Return uPlot's options for reward curves. A curve with the index LARGEST is the sum of the other terms."""
     return tuple(_line(name, COLORS[k]) if k < LARGEST else _line(name, OTHERS, DASH) for k, name in enumerate(names))
 
 
 def reward_curves(terms: Sequence[str], values: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """Return names and curves (K,) for the LARGEST largest reward terms, then for the sum of the others, from the `values`
-    (terms, K) of all `terms`.
+    """Return names and curves (K,): the largest reward terms, LARGEST of them, then the sum of the other terms. `values`
+    (terms, K) are those of all `terms`.
     """
     sizes = np.abs(np.nan_to_num(values)).sum(axis=1)
     largest = sorted(np.argsort(-sizes, kind="stable")[:LARGEST].tolist())
@@ -168,7 +168,7 @@ def gait_diagram(feet: Sequence[str], times: np.ndarray, contacts: np.ndarray, d
     """Return HTML with a row for each foot. Bars show the `times` (K,) [s] at which the foot's `contacts` (F, K) are 1."""
     rows = []
     for name, own in zip(without_common_words(feet), contacts, strict=True):
-        # Steps at which the foot comes down, and at which it has left the ground. A step covers the `dt` before its time.
+        # Steps at which the foot comes down, or has just left the ground. A step covers the `dt` before its time.
         edges = np.flatnonzero(np.diff(np.concatenate([[False], own > 0.5, [False]]).astype(int)))
         bars = "".join(
             f'<rect x="{times[a] - dt:.3f}" width="{times[b - 1] - times[a] + dt:.3f}" height="1" fill="{ACTUAL}"/>'

@@ -39,7 +39,7 @@ SLOWEST, FASTEST = 0.1, 4.0
 HARDEST_PUSH = 3.0
 """Largest change of a robot's velocity by one push [m/s]."""
 BEHIND_S = 0.2
-"""Largest delay that the simulation makes up for. If it is longer, the machine is too slow or was busy [s]."""
+"""Largest delay that the simulation makes up for [s]. The rest of a longer delay is dropped."""
 PACE_S = 2.0
 """Real time over which the pace is measured [s]."""
 FREE_JOINT = 0
@@ -48,7 +48,7 @@ FREE_JOINT = 0
 
 @dataclass
 class Watched:
-    """A run folder or a shipped policy that is watched for changes of the checkpoint to show."""
+    """A run folder or a shipped policy, watched for a new checkpoint to show."""
 
     cfg: TaskConfig
     folder: Path
@@ -89,7 +89,7 @@ class Watched:
 
 
 def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
-    """Return the run that the argument POLICY, `name`, stands for; without a name the newest run. The run need not have a
+    """Return the run that `name`, the argument POLICY, stands for; if `name` is None, the newest run. The run need not have a
     checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
 
     Raises:
@@ -134,14 +134,14 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
     """Return overrides for `num_envs` undisturbed robots; the overrides in `asked` may disturb them."""
     if isinstance(cfg, LeggedConfig):
-        keep_length = len(grounds_of(cfg)) == 1  # on a single tile, episodes have to end before the edge
+        keep_length = len(grounds_of(cfg)) == 1  # on a single tile, episodes end before robots reach the edge
         seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
         return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
     return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
 
 
 class Session:
-    """A few robots under a policy; not thread-safe."""
+    """Simulation of a few robots that a policy controls; not thread-safe."""
 
     def __init__(
         self,
@@ -174,7 +174,7 @@ class Session:
         self.followed = 0
         """Number of the robot that the camera follows and the plots show."""
         self.pace = 1.0
-        """Ratio of made to due steps over the last PACE_S; it is below 1 if the machine is too slow."""
+        """Simulated time of the last PACE_S as a share of the chosen speed; below 1 if the machine is too slow."""
         self._due = self._wanted = self._made = 0.0
         if self.checkpoint is not None:  # check the checkpoint before anything is built
             check_fits(self.checkpoint, read_checkpoint(self.checkpoint), watched.cfg)
