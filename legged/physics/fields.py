@@ -112,8 +112,8 @@ FIELDS = {
         neutral=1.0,
     ),
     "restitution": Field(
-        "share of its speed that a shape keeps when it bounces; it sets the damping of contacts, and their stiffness stays;"
-        " below 0.135 the damping ratio is 1",
+        "share of its speed that a shape keeps when it bounces; from it follows the contacts' damping ratio, which is 1 for"
+        " shares below 0.135",
         "1",
         "shapes",
         lambda scene, model: scene.shapes(model),
