@@ -112,8 +112,8 @@ FIELDS = {
         neutral=1.0,
     ),
     "restitution": Field(
-        "share of its speed that a shape keeps when it bounces, from a lower damping of its contacts at the same stiffness;"
-        " below 0.135 the damping ratio is 1",
+        "share of its speed that a shape keeps when it bounces; from it follows the contacts' damping ratio, which is 1 for"
+        " shares below 0.135",
         "1",
         "shapes",
         lambda scene, model: scene.shapes(model),
@@ -185,7 +185,7 @@ FIELDS = {
         (Change("dof_frictionloss", "add"),),
     ),
     "joint_offset": Field(
-        "error of each joint's encoder, added to the true angle in the control law and in `dof_pos`",
+        "error of each joint's encoder: control law and observation `dof_pos` get the true angle plus this error",
         "rad",
         "joints with a motor",
         lambda _, model: np.arange(model.nu),
@@ -203,7 +203,7 @@ FIELDS = {
         lowest=0.0,
     ),
     "actuator_gain": Field(
-        "force or torque added per unit of control; a position servo's force towards its target grows with it",
+        "addition to the force or torque per unit of control, which is the stiffness of a position servo",
         "N m or N",
         "actuators",
         lambda _, model: linear_actuators(model),
