@@ -185,7 +185,7 @@ def test_all_rewards_are_captured_on_a_gpu():
     assert task.captured
     assert task.rewards.last.isfinite().all()
     assert task.rewards.last.abs().sum(dim=1)[[task.rewards.names.index("alive"), task.rewards.names.index("hip_pos")]].all()
-    with pytest.raises(AttributeError, match="only where a term reads it"):
+    with pytest.raises(AttributeError, match="only if a term reads it"):
         task.last_dof_pos  # noqa: B018
 
 
