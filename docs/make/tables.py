@@ -20,7 +20,7 @@ import yaml
 ROOT = Path(__file__).resolve().parents[2]
 MARKED = re.compile(r"(<!-- table: ([^\n]*?) -->\n)(.*?)(<!-- end -->|(?=<!-- table:)|\Z)", re.DOTALL)
 WARP, C = "mujoco_warp", "mujoco"
-FLAT = ("anymal_c", "anymal_b", "anymal_d", "spot", "go1", "go2", "a1", "g1", "h1", "cassie")
+FLAT = ("anymal_c", "anymal_b", "anymal_d", "spot", "go1", "go2", "go2w", "a1", "g1", "h1", "cassie")
 TOLD_LESS = ("blind", "proprio", "estimator", "student", "student_ppo")
 """Variants of anymal_c whose policies observe less."""
 SOLVERS = ("mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit")
@@ -208,7 +208,7 @@ def results(shipped: Shipped) -> str:
         beside = f", sharing the GPU with {others} other training{'s' * (others != '1')}" if others != "0" else ""
         return f"{gpu}, {said}: {wall.partition(' ')[0]} s{beside}"
 
-    tasks = ("anymal_c_flat", "anymal_c", "g1_flat", "go2_real", "half_cheetah")
+    tasks = ("anymal_c_flat", "anymal_c", "g1_flat", "go2_real", "go2w", "half_cheetah")
     rows = [[f"`{task}`", shipped.learns(task), training(task), quality(task)] for task in tasks]
     return table(("task", "what it learns", "training", "quality in C MuJoCo"), rows)
 
