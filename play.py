@@ -1,4 +1,4 @@
-"""See a policy walk, and export it: python play.py --task anymal_c_flat."""
+"""Film and export of a policy: `python play.py --task anymal_c_flat`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Train a policy: python train.py --task anymal_c_flat."""
+"""Training of a policy: `python train.py --task anymal_c_flat`."""
 
 import sys
 

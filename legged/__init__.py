@@ -1,17 +1,17 @@
-"""Robots learn to walk and run: tasks on batched MuJoCo, trained by rsl-rl.
+"""A framework in which robots learn to walk and run. MuJoCo simulates many robots at once, and rsl-rl trains their policies.
 
-The names of this package are imported at their first use, because a robot's computer runs `legged.deploy` without torch and
-MuJoCo.
+Most names in `__all__` are imported only at their first use. So `legged.deploy` also runs on a robot's computer that has
+neither torch nor MuJoCo.
 """
 
-from legged.process.startup import importing, only_lists  # first, because it records the start time
+from legged.process.startup import importing, only_lists  # comes first, because this module records the start time
 
 import importlib
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING or not only_lists():
-    from legged.process.headless import HEADLESS  # before MuJoCo, because it sets MUJOCO_GL
+    from legged.process.headless import HEADLESS  # must precede MuJoCo, because this module sets MUJOCO_GL
     from legged.errors import ConfigError
     from legged.gymnasium_ids import announce
 
@@ -41,7 +41,7 @@ _HOMES = {
     "task_config": "legged.registry",
     "unit": "legged.envs",
 }
-"""Name -> module that it is imported from at its first use."""
+"""Name -> module from which the name is imported at its first use."""
 
 
 def __getattr__(name: str) -> Any:

@@ -36,12 +36,12 @@ class TermError(RuntimeError):
 
 
 class HostReadError(RuntimeError):
-    """Error for code in a step that reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
+    """A step reads a tensor's value on the host, or uses host data that a CUDA graph can't hold."""
 
 
 def suggest(name: str, allowed: Iterable[str], what: str = "allowed") -> str:
-    """Return the end of an error message: '; did you mean ...?' with the name in `allowed` that is most like `name`, if any,
-    and all allowed names in brackets after the word `what`.
+    """Return the end of an error message. It proposes the name in `allowed` that is most like `name`, if one is similar. Then
+    it lists all allowed names in brackets, after the word `what`.
     """
     options = sorted(allowed)
     near = difflib.get_close_matches(name, options, n=1, cutoff=0.5)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C8C00")
 """Colours of curves, bars and areas, in this order. They are those of Okabe and Ito ("Color universal design", 2008), which
-are distinct for any colour vision. The last is their yellow, darkened for a white background.
+are distinct for any colour vision. The last colour is a dark yellow for a white background.
 """
 STYLES = ("-", "--", "-.", ":")
 """Line styles, in this order, for curves that colours alone do not tell apart."""

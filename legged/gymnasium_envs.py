@@ -22,7 +22,7 @@ from legged.registry import make_task, task_config
 from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
 SEEN = ("actor", "dict")
-"""Forms of the observations: the policy's groups joined in one array, or a dictionary of all groups."""
+"""Forms of the observations: one array that joins the policy's observation groups, or a dictionary of all groups."""
 RENDER_MODES = ["rgb_array"]
 REWARD = "reward_"
 """Prefix of the reward terms in infos."""
@@ -34,7 +34,8 @@ LARGEST_PICTURE = 16384
 class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
     """The N environments of a task. At the end of an episode an environment is reset within the same step: `step` returns the
     first observation of the next episode, and `infos["final_obs"]` has the last observation of the old episode. The
-    environments have their own random state, which they put into torch's global generators during a call.
+    environments share a random state of their own. `reset` and `step` load it into torch's global generators, and restore the
+    state of these generators at the end.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]
@@ -68,9 +69,9 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
             if isinstance(side, bool) or not isinstance(side, (int, np.integer)) or not 1 <= side <= LARGEST_PICTURE:
                 raise ConfigError(f"{name}: must be a whole number of pixels from 1 to {LARGEST_PICTURE}, got {shown(side)}")
         if config is not None and not (isinstance(config, Mapping) and all(isinstance(path, str) for path in config)):
-            raise ConfigError(f"config: expected settings by dotted path, {{'sim.dt': 0.004}}; got {shown(config)}")
+            raise ConfigError(f"config: expected settings by dotted path, such as {{'sim.dt': 0.004}}; got {shown(config)}")
         if "env.num_envs" in (config or {}):
-            raise ConfigError("config: env.num_envs: the argument num_envs of make_vec sets the number of environments")
+            raise ConfigError("config: env.num_envs: set the number of environments by make_vec(..., num_envs=...) instead")
         self.num_envs, self._to_numpy = num_envs, to_numpy
         self.render_mode, self._size = render_mode, (int(width), int(height))
         self._device = pick_device(str(device), "device")
@@ -81,10 +82,10 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         self._random: list[Tensor] | None = None
         with self._own_random_numbers():
             self.task: Any = make_task(cfg, self._device, graph=False)
-            """The task, a `legged.envs.BaseTask`. After the end of an episode it is already in the next one."""
-            # On a GPU the step is captured anew, with the copies of final states. On the CPU there is no capture to check.
+            """The task, a `legged.envs.BaseTask`. An environment whose episode has ended is already in its next episode."""
+            # On a GPU, keep_final_step captures the step and the copies of the final state as one CUDA graph.
             self.final = keep_final_step(self.task, graph=self._device.type == "cuda")
-            # Terms create buffers at their first call, and the initial state includes them. So one step is made and undone.
+            # Some terms create buffers at their first call. `_beginning` must hold these buffers, so make and undo a step.
             before = self.task.state_dict()
             self.task.step(torch.zeros_like(self.task.actions))
             self._beginning = {part: {**state, **before[part]} for part, state in self.task.state_dict().items()}
@@ -109,7 +110,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
 
     @contextmanager
     def _own_random_numbers(self) -> Iterator[None]:
-        """Let torch draw from this environment's random numbers in the block; restore the global state afterwards."""
+        """Let torch use the random state of these environments within a `with` block. Then restore torch's global state."""
         on_gpu = [self._device] if self._device.type == "cuda" else []
         with torch.random.fork_rng(on_gpu):
             if self._random is not None:
@@ -144,16 +145,16 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
             return self._seen(self.task.reset()), {}
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Make a step with `actions` (N, D). Return the observations (N, width), the rewards (N,), masks (N,) of the episodes
-        that ended in a failure and of those whose time ran out, and infos.
+        """Make a step with `actions` (N, D). Return the observations (N, width), the rewards (N,), a mask (N,) of
+        episodes that ended in a failure, a mask (N,) of episodes whose time ran out, and infos.
 
-        Infos have the reward terms, `reward_<name>` (N,). For environments whose episode ended, these are in `final_info` and
-        the last observations in `final_obs`. With NumPy, `final_obs` is an array of N objects, None where the episode
-        goes on; the key is absent if no episode ended. With tensors, `final_obs` is (N, width), and valid where the mask
-        `_final_obs` is true.
+        Infos hold each reward term as `reward_<name>` (N,). Where an episode ended, `final_info` holds the terms instead, and
+        `final_obs` the last observation. With NumPy, `final_obs` is an array of N objects, which are None where the episode
+        goes on. Both keys are absent if no episode ended. With tensors, `final_obs` is (N, width), and its rows are valid
+        where the mask `_final_obs` is True.
 
         Raises:
-            ValueError: the actions have another shape, or are not real numbers.
+            ValueError: the shape of the actions is not (N, D), or they are not real numbers.
         """
         with self._own_random_numbers():
             observations, rewards, _, _ = self.task.step(actions)
@@ -170,14 +171,14 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
         return seen, rewards, terminated, truncated, infos
 
     def _seen(self, groups: Mapping[str, Tensor]) -> Any:
-        """Return the observations in the requested form."""
+        """Return the policy's observation groups in one array, or a dictionary of all `groups`."""
         if self._groups is None:
             return {name: self._given(group) for name, group in groups.items()}
         chosen = [groups[name] for name in self._groups]
         return self._given(chosen[0] if len(chosen) == 1 else torch.cat(chosen, dim=1))
 
     def _given(self, value: Tensor) -> Any:
-        """Return a tensor as it is or as an array. The array of a tensor on the CPU shares the tensor's memory."""
+        """Return `value` itself or, with `to_numpy`, as an array. The array of a CPU tensor shares the tensor's memory."""
         return value.cpu().numpy() if self._to_numpy else value
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
@@ -187,7 +188,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
             RunError: this machine cannot render.
         """
         if self.render_mode is None:
-            gymnasium.logger.warn('render() shows nothing without a render mode: make(..., render_mode="rgb_array")')
+            gymnasium.logger.warn('render() returns None without a render mode; try make(..., render_mode="rgb_array")')
             return None
         if self._camera is None:
             self._camera = camera_of(self.task, 1, *self._size)
@@ -205,7 +206,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
 
 
 class TaskEnv(gymnasium.Env):  # type: ignore[misc]
-    """One environment of a task. At the end of an episode `step` returns its last observation; `reset` starts the next."""
+    """One environment of a task. The last step of an episode returns its last observation. `reset` starts a new episode."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES}  # type: ignore[misc]
 
@@ -225,18 +226,18 @@ class TaskEnv(gymnasium.Env):  # type: ignore[misc]
             ConfigError: `options` are given.
         """
         super().reset(seed=seed)
-        self._vector.np_random = self.np_random  # the first seed comes from here
+        self._vector.np_random = self.np_random  # without a seed, the first reset draws one from this generator
         seen, infos = self._vector.reset(seed=seed, options=options)
         self._over = self._shows_the_next = False
         return row(seen, 0), infos
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Make a step with `action` (D,). Return the observation, the reward, True if the episode ended in a failure, True if
-        its time ran out, and infos with the reward terms, `reward_<name>`.
+        its time ran out, and infos with each reward term as `reward_<name>`.
 
         Raises:
             ResetNeeded: no episode is running.
-            ValueError: the action has another shape, or is not of real numbers.
+            ValueError: the shape of the action is not (D,), or it does not consist of real numbers.
         """
         if self._over:
             raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() before step()")
@@ -253,7 +254,8 @@ class TaskEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             RunError: this machine cannot render.
         """
-        if self._shows_the_next and self.render_mode is not None:  # show the episode's end; only a reset can follow
+        if self._shows_the_next and self.render_mode is not None:
+            # The task is already in the next episode. Write the old episode's final state. Only a reset can follow.
             self.task.physics.write(torch.ones_like(self.task.reset_buf), self._vector.final.qpos, self._vector.final.qvel)
             self.task.sense()
             self._shows_the_next = False
@@ -266,7 +268,7 @@ class TaskEnv(gymnasium.Env):  # type: ignore[misc]
 
 
 def row(value: Any, index: int) -> Any:
-    """Return one row of an array, or of the arrays of a dictionary."""
+    """Return row `index` of an array. For a dictionary of arrays, return a dictionary of these rows."""
     return {name: part[index] for name, part in value.items()} if isinstance(value, dict) else value[index]
 
 

@@ -1,7 +1,7 @@
 """Gymnasium ids of our tasks: `legged/<task>`.
 
-This module does not import Gymnasium. The ids are registered as soon as other code imports Gymnasium, which imports our
-classes by name when it makes an environment.
+This module does not import Gymnasium. The ids are registered as soon as other code imports Gymnasium. Gymnasium imports
+our classes by name when it makes an environment.
 """
 
 import importlib.util
@@ -25,7 +25,8 @@ def announce(names: Callable[[], Iterable[str]]) -> None:
 
 
 def add_ids(names: Iterable[str]) -> None:
-    """Register these tasks, replacing earlier ids. Does nothing while Gymnasium is not imported.
+    """Register the tasks `names` with Gymnasium and replace earlier ids of the same names.
+    Do nothing before Gymnasium is imported.
 
     Gymnasium refuses names with characters other than letters, digits and `_:.-`, and refuses `x` together with `x-v1`. A
     refused task gets no id.

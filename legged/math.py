@@ -61,7 +61,8 @@ def uniform(low: float, high: float, shape: tuple[int, ...], device: torch.devic
 
 
 def masked_set_(target: Tensor, mask: Tensor, value: Tensor | float) -> None:
-    """Write `value` into the rows of `target` (N, ...) in which `mask` (N,) is True, without a list of indices.
+    """Write `value` into the rows of `target` (N, ...) in which `mask` (N,) is True. Unlike indexing by a mask, this does not
+    wait for the GPU.
 
     Other rows stay bit-identical, NaN included. `value` is a number or a tensor of the shape of `target`.
     """

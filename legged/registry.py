@@ -44,13 +44,13 @@ CLASSES = {
     "HalfCheetah": "legged.envs.half_cheetah",
     "Humanoid": "legged.envs.humanoid",
 }
-"""Task class of this package that `class:` in a task's YAML can name -> its module."""
+"""Name of a task class of this package, for `class:` in a task's YAML -> module of the class."""
 
 
 @dataclass(frozen=True)
 class _Entry(Registered):
     task_class: type[BaseTask] | None
-    """Task class; None if the configuration names it, or takes it from the task that it extends."""
+    """Task class; None if the configuration determines the class, by `class:` or by the task that it extends."""
 
 
 _REGISTERED: dict[str, _Entry] = {}
@@ -61,8 +61,9 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
     LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), else the class of the task
     that it extends, else LeggedRobot.
 
-    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. The path of the
-    file, and paths in a mapping, are relative to the folder of the calling module, else to the working directory.
+    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. Relative paths,
+    of the YAML file or in a mapping, start at the folder of the calling module. They start at the working directory if this
+    folder lacks the YAML file, or if the calling module is not a file.
 
     Raises:
         ConfigError: the name is invalid, or the class or the configuration has a wrong type.
@@ -83,8 +84,8 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
 
 
 def import_tasks(name: str) -> None:
-    """Register user-defined tasks: run the module with that name or path, or register the YAML file at that path. `name` may
-    hold several, separated by commas, such as the module of a class and a YAML file that uses the class.
+    """Register user-defined tasks. `name` is the name or path of a module to run, or the path of a YAML file. Commas
+    separate several names, such as the module of a class and a YAML file that uses the class.
 
     Raises:
         ConfigError: a module or a file can't be found, or fails.
@@ -167,7 +168,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
         ConfigError: `Config` is not a frozen dataclass that extends the schema of LeggedRobot or BaseTask.
     """
     base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
-    # Without the decorator, the fields of a class would be ignored silently.
+    # Without @dataclass, the fields that a class adds would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):
         raise ConfigError(
@@ -178,7 +179,7 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
 
 
 def task_schema(name: str) -> type[TaskConfig]:
-    """Return the schema of a task's configuration. For a task that does not exist any more, return that of a legged robot."""
+    """Return the schema of a task's configuration. For a task that no longer exists, return the schema of LeggedRobot."""
     try:
         return _schema_of(task_class(name))
     except ConfigError:
@@ -204,7 +205,7 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
     """Check that every term whose number was rescaled from another robot declares its unit.
 
     Raises:
-        ConfigError: a term that runs, with a number other than 0, has no unit.
+        ConfigError: a term in use has a rescaled number other than 0, but declares no unit.
     """
     running = {
         "_reward_": set(cfg.rewards.scales),
@@ -223,8 +224,9 @@ def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
                     raise ConfigError(
                         f"{cfg.origins.where(path)}: the number is rescaled from another robot, but"
                         f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit. Write @unit("{example}") above the method (from legged import unit), with the'
-                        ' unit of its return value; a plain number has @unit("1"). A docstring does not count'
+                        f' declares no unit. Write @unit("{example}") above the method, with the unit of its return value'
+                        ' (from legged import unit). For a value without a unit, write @unit("1"). A unit in the docstring is'
+                        " not read"
                     )
 
 
@@ -237,7 +239,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without one
+        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without a unit
 
     def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, LeggedRobot):
@@ -257,7 +259,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
 
 
 def make_task(cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None) -> Any:
-    """Return the task of a configuration, an instance of `task_class`, built on its own terrain or on the given one.
+    """Build and return the task of a configuration. The task is on the given terrain, or on its own if `terrain` is None.
 
     Raises:
         ConfigError: the configuration does not fit the engine, or the class does not call super().__init__.

@@ -1,4 +1,4 @@
-"""Saving and loading of an object's state: the tensors that its class names in `STATE`."""
+"""Saving and loading of an object's state. The state consists of the tensors that are listed in `STATE` of the class."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +16,7 @@ def state_of(owner: Any) -> dict[str, Tensor]:
 
 
 def load_state(owner: Any, state: Mapping[str, Any]) -> None:
-    """Copy the values that `state_of` saved into the tensors of `owner.STATE`. The values may be on any device.
+    """Copy a `state` that `state_of` returned into the tensors that `owner.STATE` names. The values may be on any device.
 
     Raises:
         StateError: a tensor is missing, or has another shape or type.
@@ -25,7 +25,7 @@ def load_state(owner: Any, state: Mapping[str, Any]) -> None:
 
 
 def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> None:
-    """Copy `saved` values into `tensors` of the same names. `of` is the owner's name, for errors.
+    """Copy `saved` values into `tensors` of the same names. `of` is the owner's name, for error messages.
 
     Raises:
         StateError: a tensor is missing, or has another shape or type. In this case no tensor is copied.

@@ -13,12 +13,12 @@ from legged.process.paths import exists
 _IMPORTED: set[str] = set()
 """Names of the modules that were run from files."""
 _FOLDERS: set[str] = set()
-"""Folders of all modules that were run, from files or by name."""
+"""Folders of the modules that were run from files. After an import by module name, also the working directory."""
 
 
 def run_module(name: str) -> None:
-    """Import a user-defined module, 'my_tasks' or 'path/my_tasks.py', so that it registers its tasks. The module can import
-    others in its folder.
+    """Import a user-defined module, which registers its tasks. `name` is the name of a module ('my_tasks') or its file
+    ('path/my_tasks.py'). The module can import other modules in its folder.
 
     Raises:
         ConfigError: the module can't be found, or fails.
@@ -42,15 +42,15 @@ def run_module(name: str) -> None:
 
 
 def find_modules_in(folder: str) -> None:
-    """Add a folder to Python's search path, if it is missing. Python adds the working directory only for `python -m` and the
-    like, not for an installed program.
+    """Add a folder to Python's search path, unless the path contains it already. For an installed program such as `legged`,
+    Python does not add the working directory itself.
     """
     if folder not in sys.path:
         sys.path.insert(0, folder)
 
 
 def is_of_a_module(file: str) -> bool:
-    """Return True if a code file lies in or below the folder of a module that was run, outside site-packages."""
+    """Return True if a code file is in or below the folder of a user-defined module, and not in site-packages."""
     path = Path(file)
     return any(path.is_relative_to(folder) for folder in _FOLDERS) and "site-packages" not in path.parts
 
@@ -76,17 +76,17 @@ def _run(path: Path) -> None:
 
 
 def _described(name: str, is_file: bool, folder: str, error: BaseException) -> ConfigError:
-    """Return the error of the module `name` as a ConfigError: the module does not exist, or it failed at a line."""
+    """Return a ConfigError that says that the module `name` does not exist, or why and in which line it failed."""
     if isinstance(error, ModuleNotFoundError) and not is_file and f"{name}.".startswith(f"{error.name}."):
-        return ConfigError(f"--import: there is no module {shown(name)} (a module name, or a path that ends in .py)")
+        return ConfigError(f"--import: there is no module {shown(name)}; give a module name, or a path that ends in .py")
     text = " ".join(str(error.msg if isinstance(error, SyntaxError) else error).split())
     kind = "" if isinstance(error, ConfigError) else f"{type(error).__name__}: "
     return ConfigError(f"--import: {plain_path(name)}{_line(error, folder)}: {kind}{text}")
 
 
 def _line(error: BaseException, folder: str) -> str:
-    """Return ' (file, line n)' for an error: the line that cannot be parsed, or else the innermost line in a file in
-    `folder`. Return '' if there is no such line.
+    """Return the place of an error as ' (file, line n)': the line with the syntax error, or else the last line in the
+    traceback whose file is in `folder`. Return '' if there is no such line.
     """
     if isinstance(error, SyntaxError) and error.filename:
         return f" ({error.filename}, line {error.lineno})"

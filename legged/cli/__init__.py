@@ -1,1 +1,1 @@
-"""The `legged` command: one module for each sub-command."""
+"""The `legged` command. Each module has one sub-command, or a group of sub-commands such as `legged benchmark`."""

@@ -1,4 +1,4 @@
-"""`legged benchmark`: times of control steps, of training iterations and of a start."""
+"""`legged benchmark`: times of control steps, of training iterations and of the start of a training."""
 
 import argparse
 import io
@@ -48,13 +48,13 @@ KERNEL_STEPS = 20
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],
     "terrain, our collider": [("sim.terrain_collider", "cells")],
-    # The general collider needs room for its candidate pairs and for more contacts.
+    # mujoco-warp's general collider needs memory for pairs of shapes that may touch, and it finds more contacts.
     "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
 }
 KILLED = -9
 """Exit code of a process that Linux ended because memory ran out."""
 NO_ROOM = "out of memory"
-"""Text in the result if a number of robots does not fit into memory."""
+"""Text in the result if the robots do not fit into memory."""
 COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("robots", 12, lambda row: f"{row['num_envs']:,}"),
     ("control step", 14, lambda row: f"{row['control_step_ms']:.2f} ms"),
@@ -63,12 +63,12 @@ COLUMNS: tuple[tuple[str, int, Callable[[dict[str, Any]], str]], ...] = (
     ("training steps/s", 18, lambda row: f"{row['robot_steps_per_s']:,.0f}" if "robot_steps_per_s" in row else "-"),
     ("GPU memory", 12, lambda row: f"{row['gpu_memory_gib']:.1f} GiB" if "gpu_memory_gib" in row else "-"),
 )
-"""Columns of the table: heading, width in characters, and function from a row's figures to the text."""
+"""Columns of the table of `legged benchmark scale`: heading, width in characters, function that formats a row's value."""
 ENDS = "first iteration"
 CAPTURES = ("step captured", "training captured")
-"""Stages in which the start of a training captures a CUDA graph, or on the CPU checks the step."""
+"""Stages of a training's start that capture a CUDA graph. On the CPU, they only check that a capture is possible."""
 Turn = tuple[Callable[[], object], Callable[[], object]]
-"""Untimed preparation, and the timed function."""
+"""Two functions: a preparation, which is not timed, and then the function that is timed."""
 LOOPS: dict[str, Callable[..., Runner]] = {"stock": Runner, "captured": CapturedRunner}
 """Training loops by name."""
 
@@ -86,15 +86,15 @@ STEPS = (
 """Arguments of benchmarks of control steps."""
 ITERATIONS = (
     *STEPS,
-    argument("--iterations", type=int, help="training iterations of each loop, or 0; 20 by default, 3 on the CPU"),
-    argument("--runner", choices=list(LOOPS), help="time this training loop only (train.runner.loop)"),
+    argument("--iterations", type=int, help="training iterations of each loop, 0 for none; 20 by default, 3 on the CPU"),
+    argument("--runner", choices=list(LOOPS), help="time only this training loop, one of the values of train.runner.loop"),
     argument("--policy", metavar="POLICY", help="policy that moves the robots; random actions by default"),
 )
-"""Arguments of benchmarks of control steps and iterations."""
+"""Arguments of benchmarks of control steps and training iterations."""
 
 
 def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
-    """Check the arguments that all benchmarks share; return the configuration and the device."""
+    """Check the arguments of a benchmark; return the configuration and the device."""
     register_given(args, "task")
     device = pick_device(args.sim_device)
     cfg = task_config(args.task, overrides(args), on_cpu=device.type == "cpu")
@@ -108,7 +108,7 @@ def _settle(args: argparse.Namespace) -> tuple[TaskConfig, torch.device]:
 def _measure(
     cfg: TaskConfig, device: torch.device, args: argparse.Namespace, policy: Path | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """Build a task and time its steps; return the task and the figures. Without a checkpoint `policy`, actions are random."""
+    """Build a task and time its steps; return task and results. `policy` is a checkpoint; by default actions are random."""
     start = time.perf_counter()
     task = make_task(cfg, device, graph=not args.no_graph)
     synchronize(device)
@@ -158,9 +158,9 @@ def _write(args: argparse.Namespace, result: Any) -> None:
 def step(args: argparse.Namespace) -> int:
     """Time a control step, the physics in it, and training iterations: `legged benchmark step anymal_c_flat`.
 
-    Random actions move the robots; with `--policy` a policy does. Under random actions robots flail. If the physics is
-    randomised or has dry friction, the solver then needs more iterations than for robots that walk. On a GPU, torch raises an
-    error if a timed step synchronises with the host.
+    By default random actions move the robots; with `--policy` a policy moves them. If the physics is randomised or has dry
+    friction, the solver needs more iterations under random actions than for robots that walk. On a GPU, torch raises an error
+    if a timed step synchronises with the host.
     """
     cfg, device = _settle(args)
     if args.kernels is not None and device.type != "cuda":
@@ -193,9 +193,9 @@ def step(args: argparse.Namespace) -> int:
     arguments=(*ITERATIONS, argument("--robots", required=True, help="numbers of robots, e.g. 1024,4096,16384")),
 )
 def scale(args: argparse.Namespace) -> int:
-    """Measure speed and memory against the number of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
+    """Measure times and memory for several numbers of robots: `legged benchmark scale anymal_c --robots 1024,4096,16384`.
 
-    For each number of robots a separate process runs `legged benchmark step`, so that each measurement has all memory.
+    For each number of robots a separate process runs `legged benchmark step`, so that each measurement can use all memory.
     """
     sizes = [part.strip().replace("_", "") for part in args.robots.split(",")]
     if not all(size.isdecimal() and int(size) > 0 for size in sizes):
@@ -220,8 +220,8 @@ def scale(args: argparse.Namespace) -> int:
 
 
 def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, Any]:
-    """Run `legged benchmark step` for `size` robots in another process; return its results, or why it failed as `failed`.
-    Raises ConfigError if the configuration does not allow this number of robots.
+    """Run `legged benchmark step` for `size` robots in another process; return its results. If the process fails,
+    the result `failed` is the reason. Raises ConfigError if the configuration does not allow this number of robots.
     """
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "legged", "benchmark", "step", *arguments]
@@ -245,7 +245,7 @@ def _measure_apart(arguments: Sequence[str], size: int, loop: str) -> dict[str, 
     arguments=STEPS,
 )
 def ground(args: argparse.Namespace) -> int:
-    """Measure speed on different ground: `legged benchmark ground anymal_c`.
+    """Measure the speed of simulation on different ground: `legged benchmark ground anymal_c`.
 
     The task is timed on a plane, on its terrain with this package's collider, and on its terrain with mujoco-warp's general
     collider.
@@ -275,15 +275,15 @@ def startup(args: argparse.Namespace) -> int:
     """Measure how long a training takes to begin: `legged benchmark startup anymal_c_flat`.
 
     A training is started in a separate process and ended after its first iteration. The command prints the time at which each
-    stage of the start ended, and the time of `import torch` alone [s].
+    stage of the start ended, and how long `import torch` alone takes [s].
     """
     _settle(args)
     times = _time_start(args.words, args.repeats)
-    print(f"import torch: {times['torch_s']:.2f} s\na training, seconds since its process was started:")
+    print(f"import torch: {times['torch_s']:.2f} s\nstages of a training, seconds since its process was started:")
     print(*(f"  {seconds:7.2f}  {name}" for name, seconds in times["stages"].items()), sep="\n")
     print(
-        f"end of the first iteration: {times['ratio']:.2f} x import torch, or {times['ratio_without_capture']:.2f} x without"
-        f" {times['capture_s']:.2f} s for capturing graphs",
+        f"end of the first iteration: {times['ratio']:.2f} x import torch; without the {times['capture_s']:.2f} s"
+        f" for capturing graphs, {times['ratio_without_capture']:.2f} x import torch",
         flush=True,
     )
     _write(args, times)
@@ -291,9 +291,9 @@ def startup(args: argparse.Namespace) -> int:
 
 
 def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
-    """Start trainings with the arguments `given`, one to fill caches, then `repeats` more; return medians of these.
-    `torch_s` is the time of `import torch`, `capture_s` the time for capturing graphs, and `stages` the end of each stage,
-    since the start of the process [s]. `ratio` is the end of the first iteration, divided by `torch_s`.
+    """Start `repeats` trainings with the arguments `given`, after a first one that fills the caches; return medians.
+    `torch_s` is the duration of `import torch`, and `capture_s` that of capturing graphs [s]. `stages` are the times from the
+    start of the process to the end of each stage [s]. `ratio` is the end of the first iteration, divided by `torch_s`.
     """
     training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
     runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]
@@ -311,10 +311,9 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
 
 
 def _run(*arguments: str) -> dict[str, float]:
-    """Run Python in an empty folder; return the seconds from its start to the end of each stage and to its own `end`."""
+    """Run Python in an empty folder; return stage -> time of its end since Python's start [s]. `end` is Python's exit."""
     with tempfile.TemporaryDirectory() as folder, tempfile.NamedTemporaryFile("r", encoding="utf-8") as file:
-        # The child process runs in another folder. With this process's import path it finds user-defined modules, and this
-        # package even if it is not installed.
+        # With the import path of this process, the child process finds this package and user-defined modules.
         path = os.pathsep.join(str(Path(entry or ".").resolve()) for entry in sys.path)
         environment = os.environ | {"PYTHONPATH": path, STAGES_FILE: file.name}
         start = time.time()
@@ -332,10 +331,10 @@ def _run(*arguments: str) -> dict[str, float]:
 
 
 class Driver:
-    """Source of the robots' actions: a policy or random numbers. The time that it takes is not measured."""
+    """Source of the robots' actions: a policy or random numbers. The time for computing actions is not measured."""
 
     def __init__(self, task: BaseTask, act: Callable[[TensorDict], Tensor] | None) -> None:
-        """Take `act`, a policy from observations to actions; None for random actions."""
+        """`act` is the policy, a function from observations to actions (N, D). If it is None, actions are random."""
         self._task, self._act = task, act
         self._table = 0.3 * torch.randn(32, task.num_envs, task.num_actions, device=torch.device(task.device))
         self._made = 0
@@ -344,14 +343,14 @@ class Driver:
         """(N, D) actions of the next control step."""
 
     def decide(self) -> None:
-        """Restore the kept state, and choose the `actions` of the next control step."""
+        """Restore the state that `keep` stored, if any, and choose the `actions` of the next control step."""
         self.put_back()
         random = self._table[self._made % len(self._table)]
         self.actions.copy_(random if self._act is None else self._act(self._task.get_observations()))
         self._made += 1
 
     def keep(self) -> None:
-        """If a policy acts, store the physics' state, so that `put_back` can undo engine steps that are timed alone."""
+        """If a policy acts, store the physics' state. `put_back` restores this state after the physics alone was timed."""
         if self._act is not None:
             self._kept = {name: tensor.clone() for name, tensor in self._task.physics.state_tensors().items()}
 
@@ -363,21 +362,23 @@ class Driver:
 
 @torch.inference_mode()
 def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
-    """Time a task's control step, and its physics alone; return milliseconds per control step. The robots move under the
-    policy `act`, from observations to actions, or under random actions.
+    """Time a task's control step, and the physics of a control step alone; return the times [ms] and other results. The
+    policy `act` maps observations to actions. Without `act`, actions are random.
 
-    Physics alone means `decimation` engine steps under the present torques, on a GPU as one graph. If mujoco-warp simulates
-    the robots, `decimation` calls of mujoco_warp.step are timed too. The functions take turns after each step, so that
-    states, contacts and clock rates are those of a rollout. With physics alone all robots would soon lie on the ground.
+    Physics alone means `decimation` engine steps under the present torques. On a GPU, one CUDA graph contains these steps. If
+    mujoco-warp simulates the robots, `decimation` calls of mujoco_warp.step are timed too. Each control step is followed by
+    one run of the physics alone, so that states, contacts and clock rates are those of a rollout. If only the physics ran,
+    all robots would soon lie on the ground.
     """
     device = torch.device(task.device)
     driver = Driver(task, act)
-    for _ in range(50):  # then robots have landed and are in states like those of a training
+    for _ in range(50):  # let the robots land and reach states like those in a training
         driver.decide()
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):  # compiling takes minutes on a CPU
+    # On a CPU, compiling mujoco_warp.step takes minutes, so it is timed only if the user has chosen the engine.
+    if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
     turns: list[Turn] = [(driver.decide, lambda: task.step(driver.actions))]
@@ -397,7 +398,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
 
 
 def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that runs the engine steps of one control step, as a CUDA graph if the task's step is one."""
+    """Return a function that runs the engine steps of one control step. For a captured task, it is a CUDA graph."""
 
     def run() -> None:
         for _ in range(task.cfg.control.decimation):
@@ -448,8 +449,8 @@ def synchronize(device: torch.device) -> None:
 
 
 def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dict[str, Callable[..., Runner]]:
-    """Return name -> runner of the training loops to time: the loop `asked`, or all if it is None. Students of a `teacher`
-    and policies with an estimator have only the loop of the configuration.
+    """Return the training loops to time, name -> runner: the loop `asked`, or all loops if `asked` is None. Students of a
+    `teacher` and policies with an estimator can use only the loop of the configuration.
     """
     own = cfg.train.runner.loop
     if teacher is not None:
@@ -459,8 +460,8 @@ def loops_of(cfg: TaskConfig, teacher: Teacher | None, asked: str | None) -> dic
 
 
 def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> dict[str, Any]:
-    """Train new networks with the runner `kind` for `count` iterations, after a first one that does not count. Return the
-    medians of rollout, update and iteration times, and the range of iteration times [ms].
+    """Train new networks with the runner `kind` for `count` iterations, after a first iteration that is not timed. Return
+    the medians of rollout, update and iteration times, and the range of iteration times [ms].
     """
     shown: list[Progress] = []
     display = SimpleNamespace(show=shown.append)
@@ -482,8 +483,8 @@ def time_iterations(kind: Callable[..., Runner], task: BaseTask, count: int) -> 
 
 
 def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
-    """Return the kernels of a control step, slowest first, with means over `steps` steps under small random actions:
-    `launches`, the number of launches in a control step, and `total_us`, the GPU time of these launches [us].
+    """Return the kernels of a control step, slowest first. `launches` is the number of a kernel's launches in a control
+    step, and `total_us` is the GPU time of all these launches [us]. Both are means over `steps` steps with random actions.
     """
     actions = 0.3 * torch.randn(task.num_envs, task.num_actions, device=torch.device(task.device))
     task.step(actions)
@@ -498,7 +499,7 @@ def kernel_times(task: BaseTask, steps: int) -> list[dict[str, Any]]:
 
 
 def kernel_table(times: list[dict[str, Any]], longest: int) -> str:
-    """Return a table as text: the `longest` slowest kernels, and the sum of all kernels."""
+    """Return a table as text. Its rows are the slowest kernels, at most `longest` of them, and the sum over all kernels."""
     launches, total = (sum(time[key] for time in times) for key in ("launches", "total_us"))
     whole = {"name": f"all {len(times)} kernels of a control step", "launches": launches, "total_us": total}
     rows = [f"{time['total_us']:9.1f} {time['launches']:9.1f}  {time['name'][:90]}" for time in (*times[:longest], whole)]
@@ -506,25 +507,29 @@ def kernel_table(times: list[dict[str, Any]], longest: int) -> str:
 
 
 def report(task: BaseTask, result: dict[str, Any]) -> str:
-    """Return the results of a benchmark of a task as lines of text."""
+    """Return a benchmark's results as lines of text."""
     where = device_name(torch.device(task.device))
     how = "one CUDA graph, no host synchronisation in the timed steps" if task.captured else "eager"
     lines = [
         f"{task.cfg.task}, {task.num_envs} robots, {where}, {how}",
         f"  control step  {result['control_step_ms']:.3f} ms  ({result['env_steps_per_s']:,.0f} robot steps/s)",
-        *([f"  moved by {result['policy']}"] if "policy" in result else []),
+        *([f"  robots moved by {result['policy']}"] if "policy" in result else []),
         f"  physics alone {result['physics_ms']:.3f} ms  (control step = {result['ratio']:.3f} x physics)",
         *([f"  mujoco_warp.step alone {result['library_ms']:.3f} ms"] if "library_ms" in result else []),
-        *([f"  uses mujoco-warp's own launches; reason: {task.physics.why_library}"] if task.physics.why_library else []),
-        f"  robot steps with lost contacts, because their memory was too small: {result['overflows']:.0f}",
+        *(
+            [f"  part of the step uses mujoco-warp's own launches: {task.physics.why_library}"]
+            if task.physics.why_library
+            else []
+        ),
+        f"  robot steps in which contacts were lost for lack of memory: {result['overflows']:.0f}",
         f"  building the task, with compilation of kernels that were not cached: {result['build_s']:.1f} s",
     ]
     for loop, times in result.get("iterations", {}).items():
         beyond = times["iteration_ms"] - times["steps_per_iteration"] * result["physics_ms"]
         lines.append(
             f"  {loop} training: rollout {times['rollout_ms']:.1f} + update {times['update_ms']:.1f} ms = iteration"
-            f" {times['iteration_ms']:.1f} ms, {beyond:.1f} ms beyond its physics ({times['robot_steps_per_s']:,.0f} robot"
-            " steps/s)" + (f"; {times['note']}" if times["note"] else "")
+            f" {times['iteration_ms']:.1f} ms, of which {beyond:.1f} ms are not physics ({times['robot_steps_per_s']:,.0f}"
+            " robot steps/s)" + (f"; {times['note']}" if times["note"] else "")
         )
     if "gpu_memory_gib" in result:
         lines.append(f"  GPU memory in use: {result['gpu_memory_gib']:.1f} GiB")

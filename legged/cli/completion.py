@@ -19,7 +19,7 @@ from legged.terrain import TERRAIN_TYPES
 
 NAMES = ("task", "policy", "other", "task_option", "runs", "load_run", "transfer", "teacher")
 COMPLETED = {**dict.fromkeys(NAMES, "names"), "overrides": "keys"}
-"""Argument -> the shell function that lists its values: names of tasks and runs, or keys of the configuration."""
+"""Argument -> kind of its values: `names` of tasks, policies and runs, or `keys` of the configuration."""
 SCRIPT = """
 _legged_names() {{ (cd {cfg} && printf '%s\\n' *.yaml | sed 's/[.]yaml$//'); ls -d logs/*/* 2>/dev/null | sed 's/^logs.//'; }}
 _legged_keys() {{
@@ -27,7 +27,7 @@ cat <<'END'
 {keys}
 END
 }}
-# Keys that begin with $1, up to the next dot.
+# Print the keys that begin with $1, each up to the next dot after $1.
 _legged_next_keys() {{ _legged_keys | sed -n "s/^\\\\($1[^.]*[.]\\\\{{0,1\\\\}}\\\\).*/\\\\1/p" | sort -u; }}
 """
 IN_BASH = """
@@ -71,14 +71,14 @@ def completion(args: argparse.Namespace) -> int:
 
 
 def whole_parser() -> argparse.ArgumentParser:
-    """Return a parser of all commands. Its arguments name the shell functions that complete them."""
+    """Return a parser of all commands. Arguments in `COMPLETED` hold the name of the shell function that completes them."""
     whole = argparse.ArgumentParser("legged")
     commands = whole.add_subparsers()
     groups: dict[str, argparse._SubParsersAction] = {}
     for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = load(name).build_parser()
-        for action in parser._actions if name != "migrate" else ():  # `migrate --task` is a fork's task
+        for action in parser._actions if name != "migrate" else ():  # --task of `migrate` is a task of another project
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
@@ -94,7 +94,7 @@ def whole_parser() -> argparse.ArgumentParser:
 
 def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
     """Return `key=` for all settings of tasks of the classes `kinds`. If a setting is a table of terms, terrain types or
-    properties of the model, each of these has a key.
+    properties of the model, each entry of the table has its own key.
     """
     found: set[str] = set()
     for kind in kinds:

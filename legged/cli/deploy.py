@@ -1,4 +1,4 @@
-"""`legged deploy`: a simulated robot that is reached over UDP, alone or together with the robot's program."""
+"""`legged deploy`: runs a simulated robot that communicates over UDP, without or with the program of the real robot."""
 
 import argparse
 import json
@@ -39,7 +39,7 @@ LISTENING = "listening at "
 REPORT, POSES = "report.json", "poses.npy"
 """Files that the simulated robot writes into the folder of --out."""
 PRIORITY = 10
-"""Real-time priority of the simulated robot, from 1 to 99. That of the robot's program is higher."""
+"""Real-time priority of the simulated robot (Linux allows 1 to 99). The robot's program has a higher priority."""
 BORDER = 10.0
 """Width of the level ground around the tile [m]."""
 ROOM_MB = 16.0
@@ -52,18 +52,18 @@ FILM = "film.mp4"
 SIZE = (640, 360)
 """Width and height of the film [pixels]."""
 AWAY = 3.45
-"""Distance of the camera, in lengths of the robot."""
+"""Distance between camera and robot, as a multiple of the robot's largest dimension."""
 SIMULATED = ("terrain", "size", "cell", "sim_dt", "latency", "loss", "seed")
 PASSED_ON = ("input", "gamepad", "commands", "seconds", "stand_seconds", "max_tilt", "max_age", "max_missed")
 SIMULATION = (
     argument("--terrain", metavar="TYPE", help="type of tile on which the robot starts, e.g. stairs_up; by default a plane"),
-    argument("--size", type=float, help="size of the terrain, in the unit of its type, e.g. the height of a step [m]"),
-    argument("--cell", type=float, default=0.1, help="edge of the tile's cells [m]; treads are multiples of it; default 0.1"),
+    argument("--size", type=float, help="size for the type of tile, e.g. step height [m] or slope angle [degrees]"),
+    argument("--cell", type=float, default=0.1, help="side of a cell [m]; stair treads are cut to whole cells; default 0.1"),
     argument("--sim-dt", type=float, default=0.002, help="physics step [s]; default 0.002"),
     argument("--latency", type=float, default=0.0, help="delay of packets in each direction [s]; default 0"),
     argument("--loss", type=float, default=0.0, help="share of packets lost, in each direction; default 0"),
-    argument("--seed", type=int, default=1, help="seed of the loss of packets and of the motors' delay; default 1"),
-    argument("--ideal-motors", action="store_true", help="simulate ideal motors, even if the policy was trained with others"),
+    argument("--seed", type=int, default=1, help="random seed of packet loss, motor delay and terrain; default 1"),
+    argument("--ideal-motors", action="store_true", help="simulate ideal motors, even if the training used a motor model"),
     argument(
         "overrides", nargs="*", metavar="key=value", help="settings of control.actuator, e.g. control.actuator.model=ideal"
     ),
@@ -78,7 +78,7 @@ SIMULATION = (
     arguments=(
         argument("robot", metavar="ROBOT", help="name of a robot, or its folder"),
         *SIMULATION,
-        argument("--contract", type=Path, help="policy.json that defines motors and height map; by default motors are ideal"),
+        argument("--contract", type=Path, help="policy.json that defines motors and height map; default: ideal motors"),
         argument(
             "--out",
             type=Path,
@@ -90,9 +90,9 @@ SIMULATION = (
 def robot(args: argparse.Namespace) -> int:
     """Serve a simulated robot over UDP: `legged deploy robot anymal_c --terrain stairs_up`.
 
-    C MuJoCo simulates the robot in real time, with the time step --sim-dt. The network connection to the robot can delay and
-    lose packets. The command prints the port at which it listens; `python -m legged.deploy exported --robot
-    udp:127.0.0.1:PORT` runs a policy on the simulated robot.
+    C MuJoCo simulates the robot in real time, with the time step --sim-dt. With --latency and --loss, the simulated network
+    delays and loses packets. The command prints the port at which it listens. To run a policy on the simulated robot, call
+    `python -m legged.deploy exported --robot udp:127.0.0.1:PORT`.
     """
     check_simulation(args)
     if not args.seconds > 0.0:
@@ -105,7 +105,7 @@ def robot(args: argparse.Namespace) -> int:
     contract = None if args.contract is None else read_contract(args.contract)
     (rotored, motors), scan = motors_of(args, loaded, contract), scan_of(contract)
     server = Server(SimulatedRobot(rotored, terrain_of(args), sim, motors, scan), args.latency, args.loss, args.seed)
-    take_priority(PRIORITY)  # a real robot's motors and sensors do not wait for other processes
+    take_priority(PRIORITY)  # other processes must not delay the simulated robot
     print(f"{LISTENING}127.0.0.1:{server.port}", flush=True)
     report = server.run(args.seconds)
     if args.out is not None:
@@ -117,10 +117,10 @@ def robot(args: argparse.Namespace) -> int:
 
 
 def check_simulation(args: argparse.Namespace) -> None:
-    """Check the numbers of the simulation's flags.
+    """Check the values of the simulation's options.
 
     Raises:
-        ConfigError: a number is out of bounds.
+        ConfigError: a number is out of bounds, the terrain is unknown, or --size is given for a plane.
     """
     largest = 0.0
     if args.terrain is not None:
@@ -135,11 +135,11 @@ def check_simulation(args: argparse.Namespace) -> None:
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
-    """Return the robot with the inertia of its rotors, and its motors. By default both are those with which the policy in
-    `contract` was trained; the flags change them.
+    """Return the robot, including the inertia of its motors' rotors, and the motors. By default rotors and motors are those
+    with which the policy in `contract` was trained. Options of the command change these settings.
 
     Raises:
-        ConfigError: as `motors_config`.
+        ConfigError: a setting of the motors is wrong; see `motors_config`.
     """
     changes = [parse_override(text) for text in args.overrides]
     cfg, counted = motors_config(robot, contract, args.ideal_motors, changes, args.sim_dt)
@@ -147,13 +147,13 @@ def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None)
 
 
 def scan_of(contract: Contract | None) -> str:
-    """Return the rule (terrain.scan) by which the policy in `contract` measures heights; the default without a policy."""
+    """Return the rule (terrain.scan) by which the policy in `contract` measures heights; without a contract, `SCANS[0]`."""
     term = None if contract is None else contract.sources.get("heights")
     return SCANS[0] if term is None else term.scan
 
 
 def terrain_of(args: argparse.Namespace) -> Terrain | None:
-    """Return the terrain that the flags choose: one tile with level ground around it; None for a plane."""
+    """Return the terrain that the options choose: one tile with level ground around it; None for a plane."""
     if args.terrain is None:
         return None
     cfg = TerrainConfig(mesh_type="height_map", border_size=BORDER, horizontal_scale=args.cell)
@@ -166,9 +166,9 @@ def terrain_of(args: argparse.Namespace) -> Terrain | None:
     "legged deploy sim anymal_c_proprio --terrain stairs_up --size 0.17 --film",
     "legged deploy sim anymal_c_proprio 'control.actuator.delay=[4, 4]'",
     arguments=(
-        argument("policy", metavar="POLICY", help=f"an exported folder or its ONNX file, {POLICY_HELP}"),
+        argument("policy", metavar="POLICY", help=f"folder of an exported policy, its ONNX file, {POLICY_HELP}"),
         IMPORT,
-        argument("--robot", metavar="ROBOT", help="name or folder of the robot; the policy's by default"),
+        argument("--robot", metavar="ROBOT", help="name or folder of the robot; by default the robot of the policy"),
         *SIMULATION,
         *PROGRAM,
         argument("--out", type=Path, help="folder for log.npz and report.json; logs/deploy/<task> by default"),
@@ -179,7 +179,8 @@ def sim(args: argparse.Namespace) -> int:
     """Run the robot's program against a simulated robot: `legged deploy sim anymal_c_proprio`.
 
     The command exports the policy if necessary. It starts the simulated robot in one process and the program of the real
-    robot (`python -m legged.deploy`) in another one; they talk over UDP. At the end it prints how far the robot got.
+    robot (`python -m legged.deploy`) in another process. The two processes communicate over UDP. At the end the command
+    prints how far the robot moved, and whether it fell.
     """
     limits_of(args)
     check_simulation(args)
@@ -231,12 +232,12 @@ def _exported(name: str) -> Path:
 
 
 def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
-    """Return the robot to simulate: `given`, or by default the policy's. The contract states only the name of the policy's
-    robot. If the robot is user-defined, its folder is in the configuration of the run whose folder contains `exported`.
+    """Return the robot to simulate: the robot `given`, or by default the robot of the policy. The contract states only the
+    robot's name. The folder of a user-defined robot is in the configuration of the run whose folder contains `exported`.
     """
     if given is not None:
         return load_robot(given, "--robot")
-    for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels up
+    for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels above `exported`
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
             if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
@@ -267,7 +268,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         start_new_session=True,  # Ctrl-C must reach only the program, which stops the robot safely
     )
     program = None
-    if in_main_thread():  # SIGTERM to this process ends the other two as well
+    if in_main_thread():  # SIGTERM must also end the simulated robot and the program
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None
@@ -283,7 +284,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         try:
             simulator.communicate(timeout=END_S)
         except subprocess.TimeoutExpired as error:
-            raise RunError("the simulated robot did not end after the program") from error
+            raise RunError("the robot's program ended, but the simulated robot did not end") from error
         if simulator.returncode:
             raise RunError(f"the simulated robot failed (exit code {simulator.returncode}): there is no report of this run")
     finally:
@@ -298,7 +299,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
 
 
 def _wait(program: subprocess.Popen) -> int:
-    """Wait for the program; return its exit code. Ctrl-C is ignored, because the terminal sends it to the program too."""
+    """Wait for the program; return its exit code. Ctrl-C is ignored, because the terminal also sends it to the program."""
     while True:
         try:
             return program.wait()

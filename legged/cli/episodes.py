@@ -1,4 +1,4 @@
-"""`legged episodes`: recordings of single episodes, their pages, and statistics of joints."""
+"""`legged episodes`: recordings of single episodes, pages about episodes, and statistics of joint states."""
 
 import argparse
 from importlib.util import find_spec
@@ -41,7 +41,7 @@ from legged.process.paths import exists, ready_to_write, relative, write_text
 from legged.tables import markdown_table, screen_table
 
 EPISODES, MOST_ROBOTS = 50, 256
-"""Default number of episodes, and largest number of robots that run them by default."""
+"""Default number of episodes, and largest default number of robots."""
 TOP = 10
 """Default number of listed episodes."""
 LIST = "episodes.md"
@@ -50,27 +50,27 @@ STEP_BYTES = 1200
 RECORDING = (
     argument("--episodes", type=int, default=EPISODES, help=f"number of episodes; {EPISODES} by default"),
     argument("--as-trained", action="store_true", help="keep the training's noise, pushes, randomisation and curricula"),
-    argument("--command", metavar="VX,VY,YAW", help="command of all episodes [m/s, m/s, rad/s]; random ones by default"),
-    argument("--terrain", metavar="TYPE", help="run on tiles of this type, e.g. stairs_up; by default as in the training"),
-    argument("--difficulty", type=float, help="difficulty of these tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
+    argument("--command", metavar="VX,VY,YAW", help="velocity command of all episodes [m/s, m/s, rad/s]; default: random"),
+    argument("--terrain", metavar="TYPE", help="type of the ground's tiles, e.g. stairs_up; default: ground of the training"),
+    argument("--difficulty", type=float, help="difficulty of tiles, 0 to 1; default: 0.5 in the first row, 0.8 in the next"),
 )
 """Options of the recording."""
 LISTING = (
-    argument("--sort", default=FELL, help=f"sort the list by this, worst first: {', '.join((FELL, *COLUMNS))}"),
-    argument("--ended", metavar="TERM", help="list only episodes that this termination ended"),
+    argument("--sort", default=FELL, help=f"sort the list by one of these, worst first: {', '.join((FELL, *COLUMNS))}"),
+    argument("--ended", metavar="TERM", help="list only episodes that this termination term ended"),
     argument("--top", type=int, default=TOP, help=f"number of episodes to list; {TOP} by default"),
-    argument("--page", metavar="IDS", help="numbers of the episodes that get a page, e.g. 3 or 3,17"),
-    argument("--worst", type=int, default=0, help="number of episodes at the top of the list that get a page"),
+    argument("--page", metavar="IDS", help="write pages about the episodes with these numbers, e.g. 3 or 3,17"),
+    argument("--worst", type=int, default=0, help="write pages about the first WORST episodes of the list"),
     argument("--parquet", action="store_true", help="also write all control steps as a Parquet table; needs pyarrow"),
 )
 """Options of a list of episodes, and of pages about episodes."""
 
 
 def _wish_of(args: argparse.Namespace) -> Wish:
-    """Return the settings of the recording that the command line asks for.
+    """Return the settings of a recording from the options of the command line.
 
     Raises:
-        ConfigError: a number is out of bounds, or the command is malformed.
+        ConfigError: a number is out of bounds, or the velocity command is malformed.
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     check_number("--num-envs", args.num_envs, 1, MOST_EPISODES)
@@ -94,11 +94,11 @@ def _check_listing(args: argparse.Namespace) -> None:
         raise ConfigError(f"--sort: cannot sort by '{args.sort}'{suggest(args.sort, (FELL, *COLUMNS))}")
     _pages(args.page, None)
     if args.parquet and find_spec("pyarrow") is None:
-        raise ConfigError("--parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'")
+        raise ConfigError("--parquet: needs pyarrow, which is not installed; run `pip install 'legged[parquet]'`")
 
 
 def _pages(text: str | None, count: int | None) -> list[int]:
-    """Return the episode numbers in `text`, the value of --page. `count` is the number of episodes, None if it is unknown.
+    """Return the episode numbers in the value `text` of --page. `count` is the number of episodes; None if it is unknown.
 
     Raises:
         ConfigError: a part is not a number, or there is no such episode.
@@ -114,7 +114,7 @@ def _pages(text: str | None, count: int | None) -> list[int]:
 
 
 def _run_episodes(policy: TrainedPolicy, wish: Wish, args: argparse.Namespace) -> tuple[Episodes, TaskConfig]:
-    """Run a policy's episodes on the device of the command line; return them and their task's configuration."""
+    """Run a policy's episodes on the device that the options choose; return the episodes and the task's configuration."""
     return roll_out(policy, wish, measuring_device(args), not args.no_graph, "--physics" if args.physics else "sim.physics")
 
 
@@ -152,15 +152,15 @@ def _show(episodes: Episodes, folder: Path, args: argparse.Namespace) -> None:
 def record(args: argparse.Namespace) -> int:
     """Record episodes and list the worst: `legged episodes record anymal_c_flat --worst 1`.
 
-    Robots run whole episodes under a policy. episodes.npz and .json hold every state, command, action, torque, contact and
-    reward term; the worst episodes are listed. With --page or --worst, chosen episodes get a page: a film and plots with a
-    common time cursor.
+    A policy controls the robots for whole episodes. The files episodes.npz and episodes.json hold every state, command,
+    action, torque, contact and reward term. The command lists the worst episodes. With --page or --worst, it also writes
+    pages about single episodes. A page has a film and plots, with a common time cursor.
     """
     _check_listing(args)
     register_given(args, "policy")
     wish, policy = _wish_of(args), policy_of(args.policy, args.checkpoint)
     _pages(args.page, wish.episodes)
-    if args.ended is not None:  # checked before the recording replaces an older one
+    if args.ended is not None:  # check the name before a new recording replaces an older one
         terms = policy.cfg.terminations
         check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
     check_wish(policy, wish)
@@ -188,9 +188,9 @@ def record(args: argparse.Namespace) -> int:
     ),
 )
 def list_(args: argparse.Namespace) -> int:
-    """List recorded episodes and make pages of them: `legged episodes list logs/episodes/anymal_c --page 7,12`.
+    """List recorded episodes and write pages about them: `legged episodes list logs/episodes/anymal_c --page 7,12`.
 
-    Nothing is simulated: the folder holds what `legged episodes record` has written.
+    Nothing is simulated, because `legged episodes record` has stored all states in the folder.
     """
     _check_listing(args)
     import_given(args)
@@ -203,8 +203,8 @@ def list_(args: argparse.Namespace) -> int:
 
 
 def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
-    """Return positional arguments `names` for policies or recordings, the options of a recording, and --out."""
-    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "policy or recording to compare the first with")
+    """Return positional arguments `names` for policies or recordings, followed by the options of a recording and --out."""
+    helps = (f"{POLICY_HELP}, or a folder of recorded episodes", "policy or recording that is compared with the first one")
     return (
         *(argument(name, metavar="POLICY", help=says) for name, says in zip(names, helps, strict=False)),
         *BUILD,
@@ -221,7 +221,7 @@ def _sources(folder: str, *names: str) -> tuple[Argument, ...]:
 def statistics(args: argparse.Namespace) -> int:
     """Measure mean and standard deviation of joint states: `legged episodes statistics anymal_c_flat --episodes 50`.
 
-    They are those of every joint's angle, velocity and torque, over new episodes of a policy or over recorded episodes.
+    The statistics cover every joint's angle, velocity and torque, in new episodes of a policy or in recorded episodes.
     """
     return _report(args, args.policy)
 
@@ -234,7 +234,7 @@ def statistics(args: argparse.Namespace) -> int:
 def compare(args: argparse.Namespace) -> int:
     """Show joint statistics of two policies side by side: `legged episodes compare anymal_c_flat logs/anymal_c_flat/RUN`.
 
-    Either may be a policy, whose episodes are then run for this purpose, or a folder of recorded episodes.
+    Each argument is a policy or a folder of recorded episodes. If it is a policy, the command runs new episodes.
     """
     return _report(args, args.policy, args.other)
 
@@ -243,13 +243,13 @@ def _report(args: argparse.Namespace, *names: str) -> int:
     """Print the joint statistics of policies or recordings, write them into the folder --out, and return 0.
 
     Raises:
-        ConfigError: there is no such policy, an option does not fit it, or two policies have different joints.
+        ConfigError: there is no such policy, an option does not fit the policy's task, or two policies have different joints.
     """
     import_given(args)
     wish = _wish_of(args)
     ready_to_write(args.out)
     sources = []
-    for name in names:  # check all of them before anything is built
+    for name in names:  # check all names before a task is built
         recorded = exists(Path(name) / ABOUT)
         sources.append(load_episodes(Path(name), "POLICY") if recorded else policy_of(name))
         if not isinstance(sources[-1], Episodes):

@@ -39,9 +39,9 @@ from legged.robots.robot import Robot, load_robot
 from legged.tables import screen_table
 
 ROBOTS = 16
-"""Default number of robots for each cell of the grid."""
+"""Default number of robots that follow each command of a grid."""
 MOST_SIZES = 16
-"""Largest number of sizes of a terrain type that are measured at the same time."""
+"""`check_points` allows MOST_ROBOTS / MOST_SIZES robots for each size, so that this many sizes can be simulated at once."""
 ENVIRONMENTS = 256
 """Default number of episodes; each runs in a separate environment."""
 IN_GYMNASIUM = 20
@@ -51,26 +51,26 @@ EVALUATED = (
     argument(
         "--out",
         type=Path,
-        help="folder for JSON and PNG files; by default the checkpoint's folder, or logs/evaluate for a shipped policy;"
-        " if settings are overridden, its subfolder changed/",
+        help="folder for JSON and PNG files; by default the run folder, or logs/evaluate/<task> for a shipped policy (with"
+        " overridden settings: the subfolder changed/ of this folder)",
     ),
 )
-"""Arguments that all evaluations of a checkpoint have."""
+"""Arguments of all commands that evaluate a checkpoint."""
 GRID = (
     *(
-        argument(f"--{axis}", help=f"low:high:step of the command grid [{unit}]; evaluation.{axis} by default")
+        argument(f"--{axis}", help=f"{axis} in the grid, low:high:step [{unit}]; the setting evaluation.{axis} by default")
         for axis, unit in AXES.items()
     ),
     argument("--robots", type=int, default=ROBOTS, help=f"robots for each command of the grid; {ROBOTS} by default"),
 )
-"""Options of a grid of velocity commands."""
+"""Options that define a grid of velocity commands."""
 
 
 def _points(full: str) -> tuple[Argument, Argument]:
-    """Return the options for the number of robots at each size of a terrain type; `full` says what --full measures."""
+    """Return the options --full and --robots-per-point. `full` is the text in the help that says what --full measures."""
     return (
-        argument("--full", action="store_true", help=f"measure {full}, with 256 robots each"),
-        argument("--robots-per-point", type=int, help="robots for each size of a type; 32, or 256 with --full"),
+        argument("--full", action="store_true", help=f"measure {full}; --robots-per-point is then 256 by default"),
+        argument("--robots-per-point", type=int, help="robots for each terrain size or stress line; 32, or 256 with --full"),
     )
 
 
@@ -78,17 +78,18 @@ def check_points(given: int | None, full: bool) -> int:
     """Return the number of robots for each size of a terrain type: the value `given` with --robots-per-point, or the default.
 
     Raises:
-        ConfigError: the number is below 1, or larger than any machine can hold.
+        ConfigError: the number is below 1 or above MOST_ROBOTS / MOST_SIZES.
     """
     check_number("--robots-per-point", given, 1, MOST_ROBOTS // MOST_SIZES)
     return given if given is not None else 256 if full else 32
 
 
 def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
-    """Return the setting that a command line describes. If `follows`, the policy must follow velocity commands.
+    """Return the setting of a measurement from its command line. If `follows`, the policy must follow velocity commands.
 
     Raises:
-        ConfigError: there is no such policy or device, or the folder cannot be written.
+        ConfigError: --num-envs is given, there is no such policy or device, or the policy cannot follow commands.
+        RunError: the output folder cannot be written.
     """
     register_given(args, "policy")
     if args.num_envs is not None:
@@ -96,7 +97,7 @@ def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
     device, policy = measuring_device(args), policy_of(args.policy, args.checkpoint)
     task = policy.cfg.task
     if follows and not isinstance(policy.cfg, LeggedConfig):
-        raise ConfigError(f"POLICY: '{task}' has no velocity commands; legged evaluate episodes {task} measures its returns")
+        raise ConfigError(f"POLICY: '{task}' has no velocity commands; use `legged evaluate episodes {task}`")
     overrides = policy_overrides(args)
     own = policy.output("evaluate")
     folder = args.out or (own / CHANGED if changes_of(overrides) else own)
@@ -123,11 +124,10 @@ def _grid_of(setting: Setting, args: argparse.Namespace | None = None) -> Grid:
 def evaluate(args: argparse.Namespace) -> int:
     """Measure a policy: `legged evaluate anymal_c_flat`.
 
-    A policy that follows velocity commands is measured as by `legged evaluate grid`. If it was trained on terrain, it is also
-    measured as by `legged evaluate terrain`. Other policies are measured as by `legged evaluate episodes`, an ONNX file or an
-    exported folder as by `legged evaluate onnx`.
-
-    The tables are printed; evaluation_<physics>.json and pictures are written beside the checkpoint.
+    A policy that follows velocity commands is measured on a grid of commands, as in `legged evaluate grid`. If the policy was
+    trained on terrain, its success on terrain is measured too, as in `legged evaluate terrain`. A policy without velocity
+    commands is measured as in `legged evaluate episodes`. ONNX files and exported folders are measured as in
+    `legged evaluate onnx`. Tables are printed. Results of a checkpoint are written to evaluation_<physics>.json and pictures.
     """
     if _exported_file(args.policy) is not None:
         _check_plain(args)
@@ -142,9 +142,9 @@ def evaluate(args: argparse.Namespace) -> int:
 
 
 def _check_plain(args: argparse.Namespace) -> None:
-    """Refuse overrides and options that have no effect on an ONNX file, because C MuJoCo runs it as it is."""
+    """Refuse overrides, and all options except --out. They would have no effect, because an ONNX file runs unchanged."""
     if args.overrides:
-        raise ConfigError(f"{args.overrides[0]}: an ONNX file runs unchanged; see the options of `legged evaluate onnx`")
+        raise ConfigError(f"{args.overrides[0]}: has no effect on an ONNX file; see the options of `legged evaluate onnx`")
     for name, value in vars(evaluate.build_parser().parse_args([args.policy])).items():
         if getattr(args, name) != value and name not in ("out", "overrides"):
             option = f"--{'import' if name == 'module' else name.replace('_', '-')}"
@@ -160,8 +160,8 @@ def grid(args: argparse.Namespace) -> int:
     """Measure velocity errors over a grid of commands: `legged evaluate grid anymal_c_flat --vx=-1:1:0.5`.
 
     Every cell of the grid is one command (vx, vy, yaw rate), which several robots follow. Tables of the errors are printed,
-    and evaluation_<physics>.json and .png written. With `--physics all` the grid is measured in every engine and solver, and
-    crossing.json and .png are written.
+    and evaluation_<physics>.json and .png are written. With `--physics all` the grid is measured in every engine and with
+    every solver of Newton, and the files are crossing.json and crossing.png.
     """
     everywhere = args.physics == EVERYWHERE
     if everywhere:
@@ -179,10 +179,11 @@ def grid(args: argparse.Namespace) -> int:
     arguments=(*EVALUATED, argument("--types", help=TYPES_HELP), *_points("all sizes of a type")),
 )
 def terrain(args: argparse.Namespace) -> int:
-    """Measure success against the size of terrain: `legged evaluate terrain anymal_c --types stairs_up,gap`.
+    """Measure success over the size of terrain: `legged evaluate terrain anymal_c --types stairs_up,gap`.
 
-    Robots cross tiles of each terrain type in growing sizes. The share of robots that arrive is printed, drawn to
-    success_<physics>.png, and written into evaluation_<physics>.json.
+    For each terrain type, the size grows from tile to tile, for example the height of steps. Robots start in the middle of
+    the tiles. The share of robots that walk out of their tile is printed, drawn to success_<physics>.png, and written to
+    evaluation_<physics>.json.
     """
     robots = check_points(args.robots_per_point, args.full)
     setting = _settle(args)
@@ -198,19 +199,19 @@ def terrain(args: argparse.Namespace) -> int:
     "legged evaluate stress go2 --lines nominal,payload,together --riser 0.12",
     arguments=(
         *EVALUATED,
-        argument("--lines", help="lines of the table, e.g. 'nominal,payload,together'; by default all, with a score"),
-        argument("--riser", type=float, help=f"height of a step [m]; by default {RISER}, scaled to the robot's size"),
+        argument("--lines", help="lines of the table, e.g. 'nominal,payload,together'; by default all, which a score needs"),
+        argument("--riser", type=float, help=f"height of a step [m]; {RISER} for an ANYmal C, scaled to other robots' size"),
         argument("--tread", type=float, default=TREAD, help=f"width of a step [m]; {TREAD} by default"),
-        argument("--payload", type=float, help="mass on the base [kg]; by default 8, scaled to the robot's mass"),
-        *_points("all lines with every solver"),
+        argument("--payload", type=float, help="mass on the base [kg]; 8 for an ANYmal C, scaled to other robots' mass"),
+        *_points("all lines with every solver setting"),
     ),
 )
 def stress(args: argparse.Namespace) -> int:
     """Measure the robustness of a policy: `legged evaluate stress anymal_c`.
 
-    Each line of the table is a disturbance (payload, friction, weak motors, delay, ...), unknown ground, or other solver
-    settings, on stairs and on the flat. The share of robots that succeed is printed and written to stress_<physics>.json and
-    .png.
+    Robots walk on stairs and on the flat. Each line of the table has a different disturbance (payload, friction, weak motors,
+    delay, ...). More lines are for terrain that no task is trained on, and for other solver settings. The share of robots
+    that succeed is printed and written to stress_<physics>.json and .png.
     """
     robots = check_points(args.robots_per_point, args.full)
     check_between("--riser", args.riser, 0.0, 1.0, "m")
@@ -233,7 +234,7 @@ def stress(args: argparse.Namespace) -> int:
             "--rmse",
             type=float,
             default=WALKING_RMSE,
-            help=f"largest velocity RMSE of a robot that walks [m/s]; {WALKING_RMSE} by default",
+            help=f"largest velocity RMSE with which a checkpoint walks [m/s]; {WALKING_RMSE} by default",
         ),
         argument("--falls", type=float, default=WALKING_FALLS, help=f"largest share of falls; {WALKING_FALLS} by default"),
     ),
@@ -241,8 +242,9 @@ def stress(args: argparse.Namespace) -> int:
 def checkpoints(args: argparse.Namespace) -> int:
     """Search a run for its first checkpoint that walks: `legged evaluate checkpoints anymal_c_flat`.
 
-    Every checkpoint of the run is measured over the grid of commands. time_to_walk.json gives the time from the
-    start of the training's process to the first one that walks [s]. A smaller train.runner.save_interval makes it finer.
+    Every checkpoint of the run is measured over the grid of commands. A checkpoint walks if its velocity RMSE is below --rmse
+    and its share of falls is below --falls. time_to_walk.json gives the time from the start of the training process to the
+    first checkpoint that walks [s]. For a more exact time, train with a smaller train.runner.save_interval.
     """
     check_number("--rmse", args.rmse, 0, 100, above=True)
     check_number("--falls", args.falls, 0, 1, above=True)
@@ -271,7 +273,7 @@ def episodes(args: argparse.Namespace) -> int:
     setting = _settle(args, follows=False)
     if isinstance(setting.policy.cfg, LeggedConfig):
         task = setting.policy.cfg.task
-        raise ConfigError(f"POLICY: '{task}' follows velocity commands; legged evaluate grid {task} measures how well")
+        raise ConfigError(f"POLICY: '{task}' follows velocity commands; use `legged evaluate grid {task}`")
     return evaluate_episodes(setting, args.episodes)
 
 
@@ -283,8 +285,8 @@ def episodes(args: argparse.Namespace) -> int:
 def gymnasium(args: argparse.Namespace) -> int:
     """Measure returns of a policy in Gymnasium's own environment: `legged evaluate gymnasium half_cheetah`.
 
-    The exported policy acts in the environment that the task is modelled on, and Gymnasium counts the returns. The figures
-    are printed and written to evaluation_gymnasium.json.
+    The exported policy acts in the Gymnasium environment that the task reproduces. Gymnasium computes the returns, which are
+    printed and written to evaluation_gymnasium.json.
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     for option in ("physics", "solver", "sim_device"):
@@ -299,9 +301,9 @@ def gymnasium(args: argparse.Namespace) -> int:
 COMMANDS = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0))
 """Default commands: vx, vy [m/s], yaw rate [rad/s]."""
 SECONDS, HOLD_S = 8.0, Grid.hold_s
-"""Default time for which a robot follows a command: one of a list, and one of a grid [s]."""
+"""Default time for which a robot follows each command [s]: SECONDS in a list of commands, HOLD_S in a grid."""
 MOST_CELLS = 10_000
-"""Largest number of commands of a grid. A single robot follows them one after the other, for seconds each."""
+"""Largest number of commands of a grid. It is limited because a single robot follows all commands, one after another."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
 """Files of an exported folder: the network, and its description."""
@@ -312,38 +314,38 @@ EXPORTED = ("policy.onnx", "policy.json")
     "legged evaluate onnx policy.onnx --robot g1 --layout holosoma",
     arguments=(
         argument("policy", nargs="+", metavar="POLICY", help="ONNX files, or exported folders"),
-        argument("--robot", help="name or folder of the robot; by default as in the policy.json"),
+        argument("--robot", help="name or folder of the robot; by default the robot that policy.json names"),
         argument(
             "--layout",
-            help="description of the observation: a YAML file, 'holosoma', or a policy.json; by default the policy.json"
-            " next to the file",
+            help="description of observation and action: a YAML file, the name holosoma, or a policy.json; by default the"
+            " policy.json next to the ONNX file",
         ),
         argument("--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"),
         *(
-            argument(f"--{axis}", help=f"low:high:step of a grid of commands [{unit}]; {AXIS} if another axis is given")
+            argument(f"--{axis}", help=f"{axis} in a grid, low:high:step [{unit}]; {AXIS} if only other axes are given")
             for axis, unit in AXES.items()
         ),
-        argument("--seconds", type=float, help=f"length of each command [s]; default {SECONDS:g}, or {HOLD_S:g} with a grid"),
+        argument("--seconds", type=float, help=f"time for each command [s]; by default {SECONDS:g}, in a grid {HOLD_S:g}"),
         argument("--friction", type=float, default=0.8, help="friction between robot and ground; 0.8 by default"),
-        argument("--rmse", type=float, help="largest mean velocity RMSE of a policy that follows the grid [m/s]"),
+        argument("--rmse", type=float, help="print the first policy whose mean velocity RMSE is at most this [m/s]"),
         argument("--out", type=Path, help=f"folder for {RESULT}; no file is written by default"),
     ),
 )
 def onnx(args: argparse.Namespace) -> int:
-    """Measure ONNX policies in plain MuJoCo, foreign ones too: `legged evaluate onnx exported/policy.onnx`.
+    """Measure ONNX policies of this or another project in plain MuJoCo: `legged evaluate onnx exported/policy.onnx`.
 
-    One robot on a plane follows commands in C MuJoCo, and the reached velocities are printed. They show whether model,
-    frames, joint order and gains are those of the training. An exported policy of this package has a policy.json next to it,
-    which describes robot and control; for a foreign policy give --robot and --layout.
+    One robot on a plane follows commands in C MuJoCo, and the reached velocities are printed. These velocities show whether
+    model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
+    to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
-    With --vx, --vy or --yaw a grid of commands is measured as by `legged evaluate grid`. With --rmse the
-    command also prints the first of the policies that follows the grid with at most this error and without a fall.
+    With --vx, --vy or --yaw the errors over a grid of commands are measured. With --rmse the command also prints the policy
+    with the shortest training that follows the grid with at most this error and without a fall.
     """
     grid = _grid_in(args)
     settling = grid.settle_s if grid else SETTLING_S
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
     if not settling < seconds <= 1000.0:
-        raise ConfigError(f"--seconds: must be above {settling:g}, the time for settling, and at most 1000, got {seconds}")
+        raise ConfigError(f"--seconds: must be above {settling:g} (the settling time) and at most 1000, got {seconds}")
     if not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [velocity_command(text) for text in args.command or ()] or COMMANDS
@@ -353,11 +355,11 @@ def onnx(args: argparse.Namespace) -> int:
     layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
     contract = layouts[0].contract
     if args.robot is None and contract is None:
-        raise ConfigError(f"--robot: is missing; name one, because the layout '{args.layout}' does not")
+        raise ConfigError(f"--robot: is missing; name a robot, because the layout '{args.layout}' names none")
     robot = load_robot(args.robot or contract.robot, "--robot")  # type: ignore[union-attr]
     policies = [ForeignPolicy(path, layout, robot) for path, layout in zip(files, layouts, strict=True)]
     if contract is not None and was_trained_with_other_motors(contract):
-        told = "the policy was trained with other motors (`actuator` in this file) than the ideal ones used here"
+        told = "the policy was trained with other motors (`actuator` in this file); this evaluation uses ideal motors"
         print(f"warning: {contract.path}: {told}", file=sys.stderr, flush=True)
     if grid:
         result = _follow_all(robot, policies, files, args, grid)
@@ -376,7 +378,7 @@ def onnx(args: argparse.Namespace) -> int:
 
 
 def _exported_file(name: str) -> Path | None:
-    """Return the ONNX file that POLICY names directly or by its exported folder; None if POLICY names something else."""
+    """Return the ONNX file `name`, or the ONNX file in the exported folder `name`; None if `name` is something else."""
     path = Path(name)
     if path.suffix == ".onnx":
         return path
@@ -385,7 +387,7 @@ def _exported_file(name: str) -> Path | None:
 
 
 def _file(name: str) -> Path:
-    """Return the ONNX file that POLICY names."""
+    """Return the ONNX file `name`, or the ONNX file in the exported folder `name`, which must exist."""
     path = _exported_file(name)
     if path is None or not exists(path) or not path.is_file():
         raise ConfigError(f"POLICY: there is no ONNX file '{name}', and no exported folder (with {EXPORTED[0]}) of this name")
@@ -401,20 +403,20 @@ def _description(file: Path, first: Path) -> Path:
 
 
 def _grid_in(args: argparse.Namespace) -> Grid | None:
-    """Return the grid of the command line; None without --vx, --vy and --yaw."""
+    """Return the grid that --vx, --vy and --yaw define; None if all three are missing."""
     if all(getattr(args, axis) is None for axis in AXES):
         if args.rmse is not None:
-            raise ConfigError("--rmse: limits the error on a grid of commands, and there is no grid; add --vx, --vy or --yaw")
+            raise ConfigError("--rmse: has no effect without a grid of commands; add --vx, --vy or --yaw")
         return None
     if args.command:
-        raise ConfigError("--command: replaces a grid; leave out either --command or --vx, --vy and --yaw")
+        raise ConfigError("--command: cannot be combined with a grid; leave out --command, or leave out --vx, --vy and --yaw")
     check_number("--rmse", args.rmse, 0, 100, above=True)
     given = {axis: AXIS if getattr(args, axis) is None else getattr(args, axis) for axis in AXES}
     vx, vy, yaw = (axis_values(f"--{axis}", text) for axis, text in given.items())
     grid = Grid(vx, vy, yaw, robots=1, hold_s=HOLD_S if args.seconds is None else args.seconds)
     check_size(grid)
     if grid.num_cells > MOST_CELLS:
-        raise ConfigError(f"--vx, --vy, --yaw: {grid.num_cells:,} commands; at most {MOST_CELLS:,} are possible")
+        raise ConfigError(f"--vx, --vy, --yaw: the grid has {grid.num_cells:,} commands; at most {MOST_CELLS:,} are possible")
     return grid
 
 
@@ -422,7 +424,7 @@ def _follow_all(
     robot: Robot, policies: list[ForeignPolicy], files: list[Path], args: argparse.Namespace, grid: Grid
 ) -> dict[str, Any]:
     """Measure every policy on the grid, print a line about each, and return all figures. Policies are sorted by
-    their training time, if they state it.
+    training time. Policies that do not state this time come first.
     """
     known = [(path, policy, _marks(policy)) for path, policy in zip(files, policies, strict=True)]
     heads = ("seconds", "velocity RMSE", "worst", "yaw rate RMSE", "worst", "falls")
@@ -450,12 +452,12 @@ def _follow_all(
     ended = (row for row in rows if row["falls"] == 0.0 and row["rmse_lin"]["mean"] is not None)
     first = next((row for row in ended if row["rmse_lin"]["mean"] <= args.rmse), None)
     when = f" after {first['wall_s']:.1f} s of training" if first and "wall_s" in first else ""
-    print(f"velocity RMSE <= {args.rmse:g} m/s without a fall: {first['file'] + when if first else 'none'}")
+    print(f"first policy with velocity RMSE <= {args.rmse:g} m/s without a fall: {first['file'] + when if first else 'none'}")
     return {**result, "rmse": args.rmse, "first": first and {k: v for k, v in first.items() if k != "cells"}}
 
 
 def _marks(policy: ForeignPolicy) -> dict[str, float]:
-    """Return the training's seconds (`wall_s`) and `iterations` from the file's metadata, without those that it lacks."""
+    """Return `wall_s` (training time [s]) and `iterations` from a policy's metadata. Missing values are left out."""
     found = {}
     for name in ("wall_s", "iterations"):
         try:

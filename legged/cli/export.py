@@ -17,7 +17,7 @@ from legged.process.command_parser import argument
 from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0
-"""Largest size of the files of one policy [MiB]."""
+"""Disk space for the exported files of one checkpoint [MiB]."""
 
 
 @sub_command(
@@ -28,16 +28,17 @@ MEGABYTES = 5.0
         argument(
             "--out",
             type=Path,
-            help="folder for the files; by default exported/ in the run folder, or logs/export/ for a shipped policy",
+            help="folder for the files; by default exported/ in the run folder (shipped policy: in logs/export/<task>)",
         ),
     ),
 )
 def export(args: argparse.Namespace) -> int:
     """Export every checkpoint of a run: `legged export go1_flat`.
 
-    Each checkpoint becomes FOLDER/<iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json. The files
-    state the iteration, and the seconds from the start of the training's process (`wall_s`). `legged evaluate onnx` finds the
-    first of these policies that walks. `legged play` exports only the last checkpoint.
+    Each checkpoint is exported to a folder <iterations>/ with policy.onnx, policy.pt, policy.weights and policy.json.
+    policy.onnx and policy.json state the number of iterations, and the time `wall_s` from the start of the training process
+    to the checkpoint [s]. `legged evaluate onnx --rmse` finds the first of these policies that walks. To export a single
+    checkpoint, use `legged play`.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:
@@ -47,10 +48,10 @@ def export(args: argparse.Namespace) -> int:
     policy = policy_of(args.policy)
     paths = checkpoints(policy.folder)
     if not paths:
-        raise ConfigError(f"POLICY: {relative(policy.folder)} has no checkpoints of a training")
+        raise ConfigError(f"POLICY: {relative(policy.folder)} contains no checkpoint")
     folder = args.out or policy.output("export") / exporting.EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
-    # Nothing is simulated, so the task is built as fast as possible: one robot, and no kernels to compile.
+    # An export simulates nothing. A task with one robot in C MuJoCo is built fastest, because it needs no kernels.
     calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
     changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
     task, act = restore(policy, changes, device, graph=False)

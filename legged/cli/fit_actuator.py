@@ -47,12 +47,12 @@ class Fit:
         argument("log", metavar="LOG", type=Path, help="the log, an .npz file"),
         argument("--out", type=Path, default=Path("actuator"), help="folder for the files; actuator by default"),
         argument("--joints", default="", help="fit only joints whose names contain one of these texts, e.g. HFE,KFE"),
-        argument("--kind", choices=("mlp", "lstm"), default="mlp", help="the network; mlp by default"),
-        argument("--hidden", help="units of the hidden layers; 32,32,32 by default, 8,8 for an lstm"),
-        argument("--samples", type=int, default=3, help="number of time steps in the input of an mlp; 3 by default"),
-        argument("--spacing", type=float, default=0.01, help="time between the time steps of --samples [s]; 0.01 by default"),
+        argument("--kind", choices=("mlp", "lstm"), default="mlp", help="kind of network; mlp by default"),
+        argument("--hidden", help="units of each hidden layer; by default 32,32,32 for an mlp, 8,8 for an lstm"),
+        argument("--samples", type=int, default=3, help="number of samples in the input of an mlp; 3 by default"),
+        argument("--spacing", type=float, default=0.01, help="time between samples in the input [s]; 0.01 by default"),
         argument("--dt", type=float, default=0.005, help="physics step of the task, sim.dt [s]; 0.005 by default"),
-        argument("--updates", type=int, help="number of training updates; 2000 by default, 3000 for an lstm"),
+        argument("--updates", type=int, help="training updates; by default 2000 for an mlp, 3000 for an lstm"),
         argument("--longest-delay", type=float, default=0.05, help="longest delay that is tried [s]; 0.05 by default"),
         argument("--seed", type=int, default=1, help="seed of the network's training"),
     ),
@@ -60,13 +60,14 @@ class Fit:
 def fit_actuator(args: argparse.Namespace) -> int:
     """Fit a motor model to a log of a real motor: `legged fit-actuator log.npz --out fits/knee --joints KFE`.
 
-    The log must have these arrays: joint_names (D,); target, position, velocity and torque (T, D) in rad, rad/s and N m; and
-    either dt [s] or time (T,). It may also have run (T,), the number of each sample's run, and the motors' stiffness, damping
-    and torque_limit. Sample at 200 Hz or more: motion between two samples can't be learned.
+    The log has T samples of D joints. It must have the arrays joint_names (D,), target and position (T, D) [rad], velocity
+    (T, D) [rad/s], torque (T, D) [N m], and either dt or time (T,) [s]. If it consists of several recordings, the array run
+    (T,) gives the number of each sample's recording. The motors' stiffness, damping and torque_limit are optional. Sample at
+    200 Hz or more, because motion between two samples can't be learned.
 
-    Two models are fitted: a drive with known parts (gains, delay, torque-speed line, friction) and a network. Both are tested
-    on a fifth of the log that is not used for fitting. The folder gets actuator.yaml (the drive as a section
-    control.actuator), network.npz (for control.actuator.network), fit.json and fit.png.
+    Two models are fitted: a parametric drive (gains, delay, torque-speed line, friction) and a network. Both are tested on a
+    fifth of the log that is not used for fitting. These files are written to the folder of --out: actuator.yaml (the drive as
+    section `control` of a task), network.npz (for control.actuator.network), fit.json and fit.png.
     """
     hidden = _widths(args.hidden) if args.hidden else HIDDEN[args.kind]
     updates = UPDATES[args.kind] if args.updates is None else args.updates
@@ -82,7 +83,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
             raise ConfigError(f"--{flag}: must be {low:g} to {high:g}, got {value:g}")
     spacing = round(args.spacing / args.dt)
     if spacing < 1 or abs(spacing * args.dt - args.spacing) > 1e-3 * args.dt:
-        raise ConfigError(f"--spacing: must be a whole multiple of --dt, {args.dt:g} s, got {args.spacing:g}")
+        raise ConfigError(f"--spacing: must be a whole multiple of --dt ({args.dt:g} s), got {args.spacing:g}")
     log = read_log(args.log).only([part.strip() for part in args.joints.split(",") if part.strip()])
     check_alike(log, args.log)
     at_steps = log.resampled(args.dt)
@@ -90,7 +91,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
     _tell(log)
     drive = fit_drive(log, args.longest_delay)
     _tell_drive(drive, log)
-    from legged.fitting.training import predict, train_network  # imported late, because the import takes long
+    from legged.fitting.training import predict, train_network  # The import is here because it takes long.
 
     weights = train_network(at_steps, args.kind, hidden, args.samples, spacing, updates, args.seed)
     fits = [Fit("parametric", log, drive.predict(log)), Fit("network", at_steps, predict(weights, at_steps))]
@@ -103,7 +104,7 @@ def fit_actuator(args: argparse.Namespace) -> int:
     for name, of in judged.items():
         print(f"  {name:10}  RMSE {of['rmse']:.3g} N m, largest {of['largest']:.3g} N m, explained {of['explained']:.2%}")
     make_folder(args.out)
-    told = "# Fitted by legged fit-actuator: copy this section into the YAML file of a task\n"
+    told = "# Fitted by `legged fit-actuator`. Copy this section into the YAML file of a task.\n"
     section = dump({"control": control_section(at_steps, drive)}, sort_keys=False, default_flow_style=None, width=120)
     write_text(args.out / "actuator.yaml", told + section)
     numbers = {name: value if np.isfinite(value) else None for name, value in vars(drive).items()}
@@ -123,7 +124,7 @@ def _widths(text: str) -> list[int]:
 
 
 def _tell(log: ActuatorLog) -> None:
-    """Print length, sampling rate, number of runs and joints of a log."""
+    """Print the length, the sampling rate, the number of runs and the names of the joints of a log."""
     seconds, held, runs = len(log.run) * log.dt, float(log.held_out.mean()), len(np.unique(log.run))
     names = ", ".join(log.joint_names[:4]) + (", ..." if len(log.joint_names) > 4 else "")
     sampled = f"{seconds:.4g} s at {1.0 / log.dt:.4g} Hz in {runs} run{'s' if runs > 1 else ''}"
@@ -148,8 +149,8 @@ def _tell_drive(drive: Drive, log: ActuatorLog) -> None:
 
 
 def errors(fit: Fit) -> dict[str, float]:
-    """Return figures of a fit on held-out samples: `rmse` and `largest`, the root mean squared and the largest error [N m],
-    and `explained`, the share of the measured torques' variance that the fit explains.
+    """Return errors of a fit on held-out samples. `rmse` is the root mean square error and `largest` the largest error [N m].
+    `explained` is the share of the variance of the measured torques that the fit explains.
     """
     measured = fit.log.torque[fit.log.held_out]
     wrong = fit.torque[fit.log.held_out] - measured
@@ -158,8 +159,8 @@ def errors(fit: Fit) -> dict[str, float]:
 
 
 def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
-    """Return the section `control` of a task with a fitted drive. `log` has the joints' names, and the physics' time step as
-    `dt`. Gains are included if the log does not state them, because they were then fitted.
+    """Return the section `control` of a task with a fitted drive. `log` has the names of the joints, and its `dt` is the
+    physics step of the task. Gains are included only if they were fitted. If the log states them, they are not fitted.
     """
 
     def named(**values: float) -> dict[str, dict[str, float]]:
@@ -177,7 +178,7 @@ def control_section(log: ActuatorLog, drive: Drive) -> dict[str, Any]:
 
 
 def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
-    """Draw three plots: torques over time and the errors of all fits, both on held-out samples, and torque over speed.
+    """Draw torques over time for held-out samples, torque over speed for all samples, and the RMSE of each fit.
 
     Raises:
         RunError: the file cannot be written.
@@ -212,7 +213,7 @@ def draw(path: Path, log: ActuatorLog, fits: list[Fit], drive: Drive) -> None:
 
 
 def _shown(log: ActuatorLog) -> np.ndarray:
-    """Return the indices of held-out samples: the first one, and those of its run in the next `SHOWN_S`."""
+    """Return the indices of the first held-out sample, and of the held-out samples of the same run in the next SHOWN_S."""
     held = log.held_out
     start = int(np.flatnonzero(held)[0])
     rows = np.arange(start, min(start + round(SHOWN_S / log.dt), len(held)))

@@ -20,7 +20,7 @@ from legged.process.paths import data_folder
 def list_(args: argparse.Namespace) -> int:
     """List tasks and robots of this installation: `legged list`.
 
-    The descriptions are comments in the files of tasks and robots; nothing is built.
+    The descriptions come from the comments at the head of the YAML files of tasks and robots.
     """
     if args.what != "robots":
         print_rows("tasks, each for `legged train TASK`", tasks())

@@ -65,7 +65,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command that `argv`, by default the arguments of this process, names first; return its exit code."""
+    """Run the command that begins `argv`; return its exit code. If `argv` is None, take the arguments of this process."""
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:
@@ -84,7 +84,7 @@ def load(name: str) -> SubCommand:
 
 
 def split(words: list[str]) -> tuple[str | None, list[str]]:
-    """Return the command that the words begin with, or None, and the remaining words."""
+    """Return the name of the command at the beginning of `words` (None without a known command), and the words after it."""
     for count in (2, 1):
         name = " ".join(words[:count])
         if len(words) >= count and name in COMMANDS:
@@ -94,10 +94,10 @@ def split(words: list[str]) -> tuple[str | None, list[str]]:
 
 @contextmanager
 def hint_at_sub_command(group: str, words: Sequence[str]) -> Iterator[None]:
-    """Add a hint to an error whose text contains one of `words`: a sub-command of `group` that is spelt almost like it.
+    """Add a hint to an error whose text contains one of `words`, if a sub-command of `group` is spelt almost like this word.
 
     Raises:
-        ConfigError: the error of the block, with the hint if there is one.
+        ConfigError: the `with` block raised it; a hint may have been added.
     """
     try:
         yield
@@ -115,7 +115,7 @@ def sub_commands(group: str) -> list[str]:
 
 
 def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
-    """Print a title, and a column of names next to one of texts. The first is at least `width` characters wide."""
+    """Print a title, and a row with name and text for each of `rows`. The column of names has at least `width` characters."""
     width = max([width, *map(len, rows)])
     print(f"{title}:")
     for name, summary in rows.items():
@@ -123,13 +123,13 @@ def print_rows(title: str, rows: Mapping[str, str], width: int = 0) -> None:
 
 
 def _print_help(words: list[str]) -> int:
-    """Print all commands, or those of a group; return the exit code 0. Raises ConfigError for an unknown word."""
+    """Print all commands, or the commands of a group `words`. Return the exit code 0. Raise ConfigError for unknown words."""
     groups: dict[str, dict[str, str]] = {}
     for name, (_, summary) in COMMANDS.items():
         groups.setdefault(name.partition(" ")[0], {})[name] = summary
     asked = [word for word in words if word not in ("--help", "-h")]
     if not asked:
-        print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...  (each has --help)\n")
+        print("Train legged robots, see them walk, measure them.\n\nusage: legged COMMAND ...  (each command has --help)\n")
         for heading, firsts in SECTIONS.items():
             rows = {name: said for first in firsts for name, said in groups[first].items()}
             print_rows(heading, rows, max(map(len, COMMANDS)))

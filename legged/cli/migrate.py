@@ -30,7 +30,7 @@ FIRST = ("rewards", "observations", "robot")
     arguments=(
         argument("file", metavar="FILE", type=Path, help="a Python file with configuration classes"),
         argument("--run", action="store_true", help="allow the command to run FILE and the modules that it imports"),
-        argument("--task", help="class or registered task to migrate; if there is only one, a new name for the task"),
+        argument("--task", help="class or registered task to migrate; if FILE has only one, the name of the new task"),
         argument("--robot", help="robot under resources/robots/, or a folder; by default the robot with the asset's name"),
         argument("--out", type=Path, default=Path("."), help="folder for the files that are written"),
         argument("--force", action="store_true", help="write over existing files"),
@@ -39,10 +39,10 @@ FIRST = ("rewards", "observations", "robot")
 def migrate(args: argparse.Namespace) -> int:
     """Translate a configuration of legged_gym or of a fork into a task: `legged migrate go2_config.py --robot go2 --run`.
 
-    The command imports the file in a child process; Isaac Gym and similar libraries need not be installed. It then reads the
-    values of the classes, and writes the settings that differ from the defaults to <task>.yaml. If the robot's pose or
-    contacts differ, it also writes robots/<task>/robot.yaml. It names the rewards with formulas of the fork's own, and every
-    setting without a counterpart, with file and line.
+    The command imports the file in a child process, which needs neither Isaac Gym nor similar libraries. The settings that
+    differ from the defaults of this package are written to <task>.yaml. If pose or contact bodies differ from those of the
+    robot, robots/<task>/robot.yaml is written too. Comments in <task>.yaml list, with file and line, the rewards whose
+    formulas are not legged_gym's, and the settings that have no counterpart in this package.
     """
     if not (exists(args.file) and args.file.is_file()):
         raise ConfigError(f"file: there is no file {shown(str(args.file))}")
@@ -50,7 +50,7 @@ def migrate(args: argparse.Namespace) -> int:
         raise ConfigError(f"file: expected a Python file with configuration classes, got {shown(str(args.file))}")
     if not args.run:
         raise ConfigError(
-            f"--run: legged migrate runs {relative(args.file)} and the modules that it imports; allow this with --run"
+            f"--run: `legged migrate` runs {relative(args.file)} and the modules that it imports; allow this with --run"
         )
     fork = read_fork(args.file, args.task)
     task = _task_name(fork.task)
@@ -68,11 +68,11 @@ def migrate(args: argparse.Namespace) -> int:
     if robot is not None and with_folder:
         make_folder(folder)
         write_text(folder / "robot.yaml", _robot_text(robot, entries, folder, args.file))
-    head = [f"Written by legged migrate from {relative(args.file)}, {fork.described}."]
+    head = [f"Written by `legged migrate` from {relative(args.file)}, {fork.described}."]
     head += [f"{subject}: {line}" for subject, lines in result.notes.items() for line in lines]
     if robot is None:
-        result.note("robot", f"this package does not have it yet: {asset_of(result) or 'the configuration names no file'}")
-        head += ["This package does not have the task's robot yet. The configuration gives these entries of its robot.yaml:"]
+        result.note("robot", f"this package has no such robot yet: {asset_of(result) or 'the configuration names no file'}")
+        head += ["This package does not have the task's robot yet. The configuration has these entries for a robot.yaml:"]
         head += [f"  {line}" for line in robot_yaml([], entries).splitlines()]
     minor = [f"without effect on a task: {', '.join(result.minor)}"] if result.minor else []
     write_text(path, task_yaml(head, result.settings, result.comments, [*map(str, result.lost), *minor]))
@@ -81,14 +81,14 @@ def migrate(args: argparse.Namespace) -> int:
 
 
 def _task_name(name: str) -> str:
-    """Return the name of the new task: `name`, after my_ if this package has a task `name`."""
+    """Return the name of the new task: `name`, with the prefix my_ if this package already has a task `name`."""
     if not is_plain_name(name):
         raise ConfigError(f"--task: the name of a task must be {PLAIN}; got {shown(name)}")
     return f"my_{name}" if exists(data_folder("cfg") / f"{name}.yaml") else name
 
 
 def _robot(asked: str | None, result: Translation) -> Robot | None:
-    """Return the robot `asked`, or by default the robot of this package that has the asset's name, if there is one."""
+    """Return the robot `asked`. If it is None, return the robot of this package that has the asset's name, or None."""
     if asked is not None:
         return load_robot(asked, "--robot")
     robots = data_folder("resources") / "robots"
@@ -106,7 +106,7 @@ def _robot_setting(robot: Robot | None, with_folder: bool, task: str, result: Tr
 
 
 def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Path) -> str:
-    """Return the text of the robot.yaml of `robot` with the configuration's `entries`; the model stays where it is."""
+    """Return the text of a robot.yaml in `folder`: the file of `robot` with changed `entries` and the same model."""
     data = read_yaml(robot.folder / "robot.yaml") | entries
     data["model"] = os.path.relpath(robot.model_path, folder.resolve())
     changed = ", ".join(entries)
@@ -114,14 +114,14 @@ def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Pat
 
 
 def _asset(file: Path, result: Translation) -> str:
-    """Return the path of the robot's file, found in a folder above the configuration, else as the configuration has it."""
+    """Return the path of the robot's model file. Without such a file in a folder above `file`, return the configured path."""
     asset = asset_of(result)
     found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
     return next(found, asset or "FILE.urdf")
 
 
 def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Robot | None) -> None:
-    """Print the file, the notes, the lost settings, and the next commands."""
+    """Print the path of the new task, the notes, the changed and lost settings, and the next commands."""
     print(f"written: {relative(path)}, {len(result.settings)} settings that differ from the defaults")
     for subject in sorted(result.notes, key=lambda subject: (*FIRST, subject).index(subject)):
         print(*(f"{subject}: {line}" for line in result.notes[subject]), sep="\n")
@@ -131,7 +131,7 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Ro
         alike = [other for other in result.lost if other.reason == entry.reason]
         if entry is alike[0]:
             also = ", ".join(other.setting for other in alike[1:])
-            print(f"not mapped: {entry}{f'; also {also}' if also else ''}")
+            print(f"not mapped: {entry}{f'; not mapped for the same reason: {also}' if also else ''}")
     if not all(entry.reason for entry in result.lost):
         plain = ", ".join(entry.setting for entry in result.lost if not entry.reason)
         print(f"not mapped, without counterpart (file and line are in {path.name}): {plain}")
@@ -144,7 +144,7 @@ def _report(args: argparse.Namespace, path: Path, result: Translation, robot: Ro
         add = ["robot", "add", _asset(args.file, result), "--name", folder.name, "--out", str(folder.parent)]
         again = ["migrate", str(args.file), "--robot", str(folder), "--out", str(args.out), "--force", "--run"]
         again += ["--task", args.task] if args.task else []
-        print("the robot is missing; add it:", *(f"  legged {shlex.join(words)}" for words in (add, again)), sep="\n")
+        print("add the missing robot, then migrate:", *(f"  legged {shlex.join(words)}" for words in (add, again)), sep="\n")
         return
     try:
         task_config(register_file(str(path)))

@@ -40,7 +40,7 @@ from legged.rendering.camera import window_opens
 ROOM_MB = 24.0
 """Disk space for the film and the exported policy [MiB]."""
 MOST_SHOWN = 9
-"""Largest number of robots in the picture on a plane."""
+"""Largest number of robots that the film shows on a plane."""
 SHOWN_ON_A_PLANE = 4
 """Default number of robots on a plane."""
 
@@ -54,16 +54,16 @@ SHOWN_ON_A_PLANE = 4
         argument("--headless", action="store_true", help="open no window, even if there is a display"),
         argument("--gif", action="store_true", help="also write a GIF"),
         argument("--no-video", action="store_true", help="film nothing; only export and measure"),
-        argument("--out", type=Path, help="folder for video and exported/; the run folder by default"),
+        argument("--out", type=Path, help="folder for the film and for exported/; by default the run folder"),
     ),
 )
 def play(args: argparse.Namespace) -> int:
     """Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
 
-    If there is a display, a window opens first, in which the robot follows the arrow keys.
+    On a machine with a display, a window opens before the film is made. There the arrow keys steer the robot.
     """
     if args.gif and args.no_video:
-        raise ConfigError("--gif: makes a film, and --no-video makes none; leave out one of them")
+        raise ConfigError("--gif: cannot be combined with --no-video; leave out one of them")
     settle_name(args, "policy")
     register_given(args, "policy")
     device = pick_device(args.sim_device)
@@ -76,7 +76,9 @@ def play(args: argparse.Namespace) -> int:
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
-                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose: its ground is part of its model")
+                raise ConfigError(
+                    f"--{flag}: '{policy.cfg.task}' has no terrain to choose, because the robot's model contains the ground"
+                )
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)
@@ -112,7 +114,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def _named(args: argparse.Namespace) -> str:
-    """Return the name of the policy: POLICY, or the run that --load-run or --experiment-name chooses for the task POLICY."""
+    """Return `args.policy`. If --load-run or --experiment-name chooses a run of the task `args.policy`, return its folder."""
     if args.load_run is None and args.experiment_name is None:
         return str(args.policy)
     flags = [("train.runner.experiment_name", args.experiment_name)] if args.experiment_name else []
@@ -126,7 +128,7 @@ def _named(args: argparse.Namespace) -> str:
 def _on_ground(
     args: argparse.Namespace, policy: TrainedPolicy, asked: list[tuple[str, Any]], device: torch.device, folder: Path
 ) -> tuple[Playground | None, LeggedRobot, Actor]:
-    """Build a task of legged robots, on a playground or a plane; return the playground or None, the task and the policy."""
+    """Build a task of legged robots on a playground or plane. Return playground (None: plane), task and policy."""
     wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
     playground = Playground.of(wanted, args.terrain, args.difficulty)
     count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE

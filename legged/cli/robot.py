@@ -1,4 +1,4 @@
-"""`legged robot`: make robots from files, and show them."""
+"""`legged robot`: make robots from URDF or MJCF files, and show robots."""
 
 import argparse
 import contextlib
@@ -28,33 +28,37 @@ from legged.robots.importing.tree import Tree
 from legged.robots.robot import Robot, load_robot
 
 SINKS, STANDS = 0.8, 0.85
-"""If the base sinks below the first share of its default height, gains are raised until the base stays above the second."""
+"""Fractions of the default base height. If the base sinks below `SINKS`, gains are raised until it stays above `STANDS`."""
 RAISED = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Factors to try on the P gains of the rule. D gains are multiplied by the square root of the factor."""
+"""Factors by which P gains that a rule chose may be raised. D gains are multiplied by the square root of the factor."""
 ROOM_MB = 100.0
-"""Disk space for the files [MiB]."""
+"""Disk space that must be free before the robot's files are written [MiB]."""
 
 
 @sub_command(
     "legged robot add path/to/my_robot.urdf --out mine",
     "legged robot add menagerie:unitree_go2 --name my_go2",
     arguments=(
-        argument("source", metavar="SOURCE", help="a URDF, an MJCF file, or menagerie:NAME"),
+        argument("source", metavar="SOURCE", help="a URDF or MJCF file, or menagerie:NAME for a model of MuJoCo Menagerie"),
         argument("--name", help="name of the robot; by default the name of the file"),
-        argument("--out", type=Path, help="folder for the robot folder and the task; by default resources/robots and cfg"),
-        argument("--extends", metavar="TASK", help="task that the new task extends; one of base/ by default"),
+        argument(
+            "--out",
+            type=Path,
+            help="where to write the robot's folder and task; by default resources/robots and cfg (outside a clone, here)",
+        ),
+        argument("--extends", metavar="TASK", help="task that the new task extends; by default one of those in cfg/base"),
         argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold still; may be repeated"),
         argument("--packages", type=Path, action="append", default=[], help="folder in which to look for package:// files"),
         argument("--stiffness", type=float, help="P gain of all joints [N m/rad]; by default from the file, or from a rule"),
         argument("--damping", type=float, help="D gain of all joints [N m s/rad]"),
-        argument("--force", action="store_true", help="write over a robot with this name"),
+        argument("--force", action="store_true", help="overwrite an existing robot of the same name"),
     ),
 )
 def add(args: argparse.Namespace) -> int:
     """Turn a URDF or MJCF file into a robot and a task: `legged robot add my_robot.urdf`.
 
-    The command writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task on flat ground, and prints what it
-    guessed.
+    The command writes a robot folder (MJCF, meshes, robot.yaml, PROVENANCE.md) and a task, on flat ground by default. Values
+    that the file lacks, such as the spawn height, are guessed and printed.
     """
     gains = _gains(args)
     path, source, licence = _source(args.source)
@@ -95,7 +99,7 @@ def add(args: argparse.Namespace) -> int:
 
 @contextlib.contextmanager
 def _nothing_left(folder: Path, task: Path) -> Iterator[None]:
-    """If the block raises a ConfigError, remove the robot folder and the task's file, unless they existed before."""
+    """If the `with` block raises a ConfigError, remove the robot folder and the task's file, unless they existed before."""
     new = [path for path in (folder, task, folder.parent) if not exists(path)]
     try:
         yield
@@ -106,8 +110,8 @@ def _nothing_left(folder: Path, task: Path) -> Iterator[None]:
 
 
 def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
-    """Test whether a robot stands under its gains. If it sinks, say so in the report, and return True. If a rule has chosen
-    the gains, also raise them until the robot stands, but not beyond the stability limit of an explicit control law.
+    """Return True if the robot sinks with its P and D gains, and add a line about this to the report. If a rule chose the
+    gains, they are raised until the robot stands, but not beyond the stability limit of an explicit control law.
     """
     height = height_under_gains(robot, robot.stiffness, robot.damping)
     if height >= SINKS * robot.height:
@@ -122,7 +126,10 @@ def _make_stand(robot: Robot, tree: Tree, guesses: Guesses) -> bool:
         higher = height_under_gains(robot, p, d)
         if higher >= STANDS * robot.height:
             guesses.stiffness, guesses.damping = raised
-            tree.say(f"guess: gains are {factor:g} times the rule's. With the rule's {sinks}, with these to {higher:.3g} m")
+            tree.say(
+                f"guess: P gains are {factor:g} times the rule's. With the rule's gains, {sinks}. With the raised gains, the"
+                f" base sinks to {higher:.3g} m"
+            )
             return True
     tree.say(f"{sinks}: check the gains and the rotors' inertia (armature), or give --stiffness and --damping")
     return True
@@ -154,12 +161,12 @@ def _check_apart(source: Path, folder: Path) -> None:
     """Check that a source file is not in the robot's new folder, because it could be overwritten there."""
     if source.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(
-            f"{relative(source)}: the new robot would overwrite its folder {relative(folder)}; give another --name or --out"
+            f"{relative(source)}: is in {relative(folder)}, which the new robot would overwrite; give another --name or --out"
         )
 
 
 def _check_task(name: str, beside: Path) -> None:
-    """Check that the task `name` exists. The new task, which has the file `beside`, extends it."""
+    """Check that the task `name` exists in cfg, or in the folder of the new task's file `beside`."""
     folders = (data_folder("cfg"), beside.parent)
     if not any(exists(folder / f"{name.removesuffix('.yaml')}.yaml") for folder in folders):
         names = {path.relative_to(folders[0]).with_suffix("").as_posix() for path in folders[0].rglob("*.yaml")}
@@ -167,8 +174,8 @@ def _check_task(name: str, beside: Path) -> None:
 
 
 def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Path]:
-    """Return the robot's folder and the task's file. The task has the robot's name, with the ending `_flat` or `_real` if the
-    extended task has this ending. Without `extends` the ending is `_flat`.
+    """Return the robot's folder and the task's file. The task has the robot's name. If `extends` ends in `_flat` or
+    `_real`, this ending is appended to the name. Without `extends` the ending `_flat` is appended.
     """
     like = "_flat" if extends is None else extends.removesuffix(".yaml")
     file = name + next((ending for ending in ("_flat", "_real") if like.endswith(ending)), "") + ".yaml"
@@ -181,7 +188,6 @@ def _places(name: str, out: Path | None, extends: str | None) -> tuple[Path, Pat
 
 
 def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: float) -> None:
-    """Print what was read, changed and guessed."""
     driven = sum(hinge.driven for hinge in tree.hinges)
     mass = sum(link.mass for link in tree.links)
     counts = f"{len(tree.hinges)} hinges, {driven} motors, {len(tree.shapes)} shapes"
@@ -205,7 +211,7 @@ def _report(tree: Tree, guesses: Guesses, folder: Path, task: Path, megabytes: f
 def show(args: argparse.Namespace) -> int:
     """Print joints, limits, gains and feet of a robot: `legged robot show go2`.
 
-    The numbers come from the robot's folder. A task with this robot uses them unless its settings change them.
+    The numbers come from the robot's folder. A task with this robot uses the same numbers, unless the task replaces them.
     """
     robot = load_robot(args.robot, "ROBOT")
     print(f"{robot.name}: {robot.mass:.4g} kg, {robot.height:.3g} m high, {robot.num_dof} joints, {relative(robot.folder)}")

@@ -40,10 +40,10 @@ from legged.process.startup import command_of_ours
 SIDE = 320
 """Width and height of the film [pixels]."""
 LONGEST_FILM_S = 900.0
-"""Time limit for filming [s]. A process that takes longer is taken to hang, and is ended."""
+"""Time limit for filming [s]. A process that takes longer is assumed to hang, and is ended."""
 LONGEST_NOTE = 1000
 MOST_COMPARED = 8
-"""Largest number of runs in a comparison, because each run has a colour and there are eight."""
+"""Largest number of runs in a comparison. Each run has its own colour, and there are eight colours."""
 PICTURE = "learning_curve.png"
 RUNS = (argument("runs", nargs="+", metavar="RUN", help="a run, its folder, or a task (its newest run)"), IMPORT)
 """The positional argument RUN, which takes one or more runs, and the option --import."""
@@ -73,7 +73,7 @@ def runs(args: argparse.Namespace) -> int:
     """List all runs in one table: `legged runs`.
 
     Every run in logs/, or in the folders given, becomes a row of experiments.html and experiments.md, newest first. The
-    page can be sorted and filtered. With `--seeds-share`, runs that differ only in their seed share a row of means.
+    HTML page can be sorted and filtered. With `--seeds-share`, runs that differ only in their seed share a row of means.
     """
     import_given(args)
     folder: Path = args.out or (args.folders[0] if args.folders else LOGS)
@@ -119,7 +119,7 @@ def report(args: argparse.Namespace) -> int:
     for folder in folders:
         ready_to_write(folder, 4.0)
         if args.film:
-            if command_of_ours():  # a drawing library may hang, and then only this ends the process
+            if command_of_ours():  # if drawing hangs, this timer ends the command's process
                 faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
             faulthandler.cancel_dump_traceback_later()
@@ -129,12 +129,12 @@ def report(args: argparse.Namespace) -> int:
 
 
 def _film(folder: Path, checkpoint: int | str | None) -> str:
-    """Film the policy of a run; return the reason if that is impossible, else an empty text."""
+    """Film the policy of a run. Return the reason why there is no film, or an empty text if there is one."""
     try:
         cfg = run_config(folder)
         if not isinstance(cfg, LeggedConfig):
             command = command_on(read_record(folder), "play")
-            return f"'{cfg.task}' has no velocity commands; {command} --gif makes a film"
+            return f"'{cfg.task}' has no velocity commands; film it with `{command} --gif`"
         torch.set_num_threads(1)
         pictures = film(TrainedPolicy(cfg, find_checkpoint(folder, checkpoint)), SIDE)
         if not exists(folder / CONFIG_FILE):
@@ -156,8 +156,8 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
 def compare(args: argparse.Namespace) -> int:
     """Show several runs side by side: `legged runs compare A B`.
 
-    comparison.html and .md show which settings differ, the learning curves in common plots, and the evaluations with
-    confidence intervals. Every run is compared with the first one.
+    comparison.html and comparison.md show the settings that differ, plots with the learning curves of all runs, and the
+    evaluations with confidence intervals. Every run is compared with the first one.
     """
     if not 2 <= len(args.runs) <= MOST_COMPARED:
         raise ConfigError(f"RUN: expected 2 to {MOST_COMPARED} runs, got {len(args.runs)}")
@@ -186,8 +186,8 @@ def compare(args: argparse.Namespace) -> int:
 def evaluations(args: argparse.Namespace) -> int:
     """Show evaluation files side by side: `legged runs evaluations logs/anymal_c/RUN logs/anymal_c/RUN`.
 
-    Evaluations of the same task, engine, overrides and grid share a row, as they may differ in the seed. Tables show the
-    row's mean and the largest deviation from it, and the picture shows mean and range.
+    Evaluations of the same task, engine, overrides and grid of commands form a group, e.g. those of several seeds. Tables
+    show the mean of each group and the largest deviation from the mean. The picture shows the mean and the range.
     """
     if args.out:
         ready_to_write(args.out)
@@ -199,7 +199,7 @@ def evaluations(args: argparse.Namespace) -> int:
     for key, seeds in grouped(results).items():
         of_episodes = {"episodes" in result for result in seeds}
         if len(of_episodes) > 1:
-            told = "some files hold errors of commands, others returns of episodes; compare them separately"
+            told = "some files hold tracking errors, and other files hold episode returns; compare them separately"
             raise ConfigError(f"{key[0]} in {key[1]}: {told}")
         (episodes if of_episodes.pop() else following)[key] = seeds
     tracked = {key: seeds for key, seeds in following.items() if any(map(has_tracking, seeds))}
@@ -210,7 +210,7 @@ def evaluations(args: argparse.Namespace) -> int:
             console.print(table(groups))
     if args.out:
         if not with_success:
-            raise ConfigError("--out: there is nothing to draw, because no file holds success on terrain; leave --out out")
+            raise ConfigError("--out: there is nothing to draw, because no file holds success rates on terrain; omit --out")
         make_folder(args.out)
         draw_comparison(with_success, args.out / "success.png")
         print(f"written: {relative(args.out / 'success.png')}")
@@ -230,7 +230,7 @@ def curves(args: argparse.Namespace) -> int:
 
     learning_curve.png shows returns, errors, falls and metrics over iterations, one line for each run. An axis on top shows
     the time, unless the runs differ by more than 5 % in the time of an iteration. For runs on terrain the picture also shows
-    the mean level of each type, and the shares of episodes after which robots moved to a higher and to a lower level.
+    the mean level on each terrain type, and how large a share of episodes moved the robot to a higher or a lower level.
     """
     folders = _folders_of(args)
     ready_to_write(args.out)

@@ -1,4 +1,4 @@
-"""`legged sweep`: search for good settings by many trainings, and report on them."""
+"""`legged sweep`: search for good settings with many trainings, and write a report on the search."""
 
 import argparse
 import gc
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from optuna import Trial
 
 TELL_S = 1.0
-"""Interval at which the trials of other processes are read [s]."""
+"""Interval at which the results of the worker processes are read and printed [s]."""
 MOST_STARTS = 10
 """Largest number of times that a worker is started. A worker that a signal has killed is started again."""
-PRUNED = "ended early: other trials were better at that step"
+PRUNED = "ended early: other trials were better at the same stage"
 SIGNALLED = 128
-"""Exit code of a training that a signal ended, minus the signal's number."""
+"""If a signal ended a training, the exit code is this number plus the signal's number."""
 MOST_FAILURES = 3
 """Number of failed trials in a row after which a worker gives up."""
 
@@ -52,11 +52,11 @@ SWEEP = (
     argument("--storage", help="where trials are stored: URL of a database that machines can share, or journal:<file>"),
     IMPORT,
 )
-"""Arguments that choose a sweep."""
+"""Arguments that `run` and `report` share."""
 
 
 def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, list[torch.device]]:
-    """Return the plan in the sweep's file and the devices of --sim-device. `trials` is the value of --trials.
+    """Return the plan that the sweep's file describes, and the devices of --sim-device. `trials` is the value of --trials.
 
     Raises:
         ConfigError: there is no such device, CPU and GPU are mixed, optuna is missing, or the file is wrong.
@@ -84,12 +84,12 @@ def _settle(args: argparse.Namespace, trials: int | None = None) -> tuple[Plan, 
 def run(args: argparse.Namespace) -> int:
     """Search for settings with which a task is learned better or sooner: `legged sweep run anymal_c_flat`.
 
-    Optuna's TPE sampler chooses the settings of each trial. A trial is one or more trainings in logs/<name of the sweep>;
-    trials that fall behind are ended early. Run the command again to continue a sweep that was stopped or killed. Several
+    Optuna's TPE sampler chooses the settings of each trial. A trial is one or more trainings in logs/<name of the sweep>.
+    Trials that fall behind are ended early. Run the command again to continue a sweep that was stopped or killed. Several
     processes, GPUs and machines can share a sweep through its storage. `legged sweep report` runs at the end.
     """
     if Ranks.now().several:
-        raise ConfigError("sweep: run it without torchrun, because it starts its processes itself")
+        raise ConfigError("sweep: can't run under torchrun, because a sweep starts its own processes; omit torchrun")
     check_number("--jobs", args.jobs, 1)
     check_number("--trials", args.trials, 1)
     plan, devices = _settle(args, args.trials)
@@ -99,17 +99,17 @@ def run(args: argparse.Namespace) -> int:
     alone = ["--sim-device", str(devices[0]), *flags]
     if devices[0].type == "cpu" and jobs > 1:
         alone.append(f"sim.threads={max(1, available_cores() // jobs)}")
-    if args.worker is not None:  # this process is one of several
+    if args.worker is not None:  # this process is a worker of another `legged sweep run`
         stopped_by = Worker(plan, trials, alone).run()
         return 128 + stopped_by[0] if stopped_by else 0
     trials.keep_to(devices[0].type)
     print(f"{plan.name}: {plan.given.trials} trials of {plan.cfg.task} for the {plan.objective_text}; {jobs} at once")
     beyond = [f"{path} {shown(plan.own[path])}" for path, drawn in plan.own_drawn.items() if drawn is None]
     if beyond:
-        print(f"no trial has the task's settings, because the sweep excludes these values: {', '.join(beyond)}")
+        print(f"the task's own settings are not tried, because the sweep excludes these values: {', '.join(beyond)}")
     again = trials.take_back()
     if trials.all:
-        numbers = f"; tried again: {', '.join(map(str, again))}" if again else ""
+        numbers = f"; trials to try again: {', '.join(map(str, again))}" if again else ""
         done = f"{len(trials.finished)} of {plan.given.trials} trials are done"
         print(f"going on in {relative(plan.folder)}: {done}{numbers}", flush=True)
     if jobs == 1:
@@ -133,7 +133,7 @@ def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -
         print(f"{time.perf_counter() - start:7.1f} s  {text}", flush=True)
 
     def tell() -> None:
-        """Print the trials of other processes that have ended since the last call."""
+        """Print the trials that other processes have finished since the last call."""
         for trial in trials.finished:
             if trial.number not in told:
                 told.add(trial.number)
@@ -151,7 +151,7 @@ def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -
         if code == 0 or pool.stopped:
             return []
         again = code < 0 and starts[number] < MOST_STARTS
-        what = "another takes its place" if again else relative(ended.output)
+        what = "another process takes its place" if again else f"see {relative(ended.output)}"
         say(f"process {number} has ended: {why_failed(ended, code)}; {what}")
         return [job(number)] if again else []
 
@@ -161,18 +161,18 @@ def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -
 
 
 class Stopped(Exception):
-    """Exception of a training that a signal ended; the argument is the number of the signal."""
+    """A signal ended a training. The exception's argument is the number of the signal."""
 
 
 class NoValue(Exception):
-    """Exception of a trial without a value. The trial counts as ended early, and the text is the reason."""
+    """A trial has no value of the objective, and counts as ended early. The exception's text is the reason."""
 
 
 class Worker:
-    """Runner of trials."""
+    """A process that runs trials one after another."""
 
     def __init__(self, plan: Plan, trials: Trials, flags: Sequence[str]) -> None:
-        """Take `flags`, the options of `legged train` for device and threads."""
+        """`flags` are options for each `legged train`: device, threads and --import."""
         self.plan, self.trials, self._flags = plan, trials, [*flags]
         self._start = time.perf_counter()
         self._failures = 0
@@ -185,7 +185,7 @@ class Worker:
             while not self._stopped and os.getppid() == parent and (trial := self.trials.next()) is not None:
                 try:
                     self._make(trial)
-                except Stopped as signalled:  # a training has its own signal handlers
+                except Stopped as signalled:  # raised if a training's own signal handler got the signal
                     self._stopped = True
                     in_trials.append(signalled.args[0])
         return [*stopped_by, *in_trials]
@@ -233,8 +233,8 @@ class Worker:
         """Train with every seed; return the mean value.
 
         Raises:
-            NoValue: the trial was ended early, its settings are invalid, or its numbers diverged.
-            Stopped: a signal ended it.
+            NoValue: the trial was ended early, its settings are invalid, a training diverged, or `value_of` raised it.
+            Stopped: a signal ended a training.
         """
         found: list[float] = []
         output = self.plan.folder / "output" / f"trial{trial.number:03d}.txt"
@@ -254,12 +254,12 @@ class Worker:
         return mean(found)
 
     def _train(self, trial: "Trial", seed: int, before: list[float]) -> float:
-        """Train with one seed; return its value. Raises as `_value`."""
+        """Train with one seed; return the value. `before` are values of earlier seeds. The errors are those of `_value`."""
         kept: list[Runner] = []
         until, plan, settings = self.plan.cfg.train.runner.max_iterations, self.plan, self.plan.settings(trial.params)
 
         def listen(found: Evaluated) -> str:
-            """Report the mean over the seeds so far to Optuna; return why to end the training, or an empty text to go on."""
+            """Report the figure to Optuna. Return the reason to end the training early, or an empty text to continue."""
             now = found.figures[plan.figure]
             if not math.isfinite(now):
                 return ""
@@ -291,7 +291,7 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
     """Return the value of the objective for a training.
 
     Raises:
-        NoValue: the training did not reach the target, or no figure is finite.
+        NoValue: the training did not reach the target, or the figure was never finite.
     """
     objective, figure = plan.given.objective, plan.figure
     values = [found.figures[figure] for found in history if math.isfinite(found.figures[figure])]
@@ -316,8 +316,8 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
 def report(args: argparse.Namespace) -> int:
     """Write table and figures of a sweep: `legged sweep report anymal_c_flat`.
 
-    table.md, best.yaml and figures of the trials that have ended are written into logs/<name of the sweep>. The sweep may
-    still be running.
+    The files table.md, best.yaml and the figures are written into logs/<name of the sweep>. The sweep may still be running;
+    the report covers the trials that have ended.
     """
     plan, _ = _settle(args)
     print(*write_report(Trials(plan, args.storage or ""), args.module), sep="\n")

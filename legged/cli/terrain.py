@@ -24,15 +24,15 @@ from legged.terrain import Terrain, check_terrain, terrain_types
     arguments=(
         *TASK,
         argument("--types", help="terrain types to show side by side instead of the task's grid, e.g. stairs_up,gap"),
-        argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in the picture, 0 to 1"),
+        argument("--difficulty", type=float, default=0.5, help="difficulty of the tiles in terrain.png, 0 to 1"),
         argument("--out", type=Path, default=Path("."), help="folder for the two PNG files"),
     ),
 )
 def terrain(args: argparse.Namespace) -> int:
     """Draw a task's terrain: `legged terrain anymal_c`.
 
-    terrain_map.png shows the whole grid of tiles from above, terrain.png shows one tile of each type with a robot on it. With
-    `--types` both pictures show these types instead of the task's.
+    terrain_map.png shows the whole grid of tiles from above. terrain.png shows one tile of each type with a robot on it. With
+    `--types` both pictures show tiles of the given types, at the given `--difficulty`.
     """
     register_given(args, "task")
     if not 0.0 <= args.difficulty <= 1.0:

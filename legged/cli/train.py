@@ -71,10 +71,10 @@ ROOM_MB = 16.0
         argument("--run-name", help="text that is appended to the run folder's name"),
         argument("--max-iterations", type=int, help="iterations of the whole training, including those before --resume"),
         argument("--note", help="a sentence about this run, for its report and the table of all runs"),
-        argument("--rl-device", help="device of the networks; that of the simulation by default"),
+        argument("--rl-device", help="device of the networks; by default the device of the simulation"),
         argument("--runner", choices=["stock", "captured"], help="training loop (train.runner.loop)"),
         argument("--headless", action="store_true", help="has no effect; accepted because legged_gym has it"),
-        argument("--show", action="store_true", help="print the full configuration, terms, actions and joints, and stop"),
+        argument("--show", action="store_true", help="print the full configuration, terms, actions and joints, and exit"),
     ),
 )
 def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = None) -> int:
@@ -90,7 +90,9 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
     if args.transfer:
         for option in ("resume", "load_run"):
             if getattr(args, option):
-                raise ConfigError(f"--{option.replace('_', '-')}: continues a training, --transfer begins one; leave one out")
+                raise ConfigError(
+                    f"--{option.replace('_', '-')}: continues a training, but --transfer begins a new one; omit one of them"
+                )
         cfg, checkpoint = transferred(args.task, overrides(args), args.transfer, args.checkpoint, on_cpu)
     elif args.resume or args.load_run is not None or args.checkpoint is not None:
         cfg, checkpoint, changed = resumed(args.task, overrides(args), args.load_run, args.checkpoint)
@@ -148,7 +150,7 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
             training.close(folder, finished)
     if finished:
         return 0
-    # If this process received no signal, its output was lost, or a signal stopped another process.
+    # A training can stop without a signal to this process: if its output is lost, or if a signal stops another process.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
@@ -156,9 +158,9 @@ def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, di
     """Build the training loop, and print facts about the engine, the robot and the teacher."""
     physics = task.physics
     if physics.why_c_engine:
-        print(f"C MuJoCo replaces mujoco-warp, because it is faster for this task: {physics.why_c_engine}", flush=True)
+        print(f"engine: C MuJoCo, which is faster here than mujoco-warp; reason: {physics.why_c_engine}", flush=True)
     if physics.why_library:
-        print(f"uses mujoco-warp's own launches; reason: {physics.why_library}", flush=True)
+        print(f"physics steps use mujoco-warp's own launches, not fused kernels; reason: {physics.why_library}", flush=True)
     for line in task.robot.adaptations if physics.robot_state is not None else ():
         print(f"{task.robot.file.model}: {line}", flush=True)
     if teacher is not None:
@@ -169,8 +171,8 @@ def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, di
 
 
 def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespace) -> Teacher | None:
-    """Return the teacher that a task imitates: for a resumed training the teacher in its `checkpoint`, else the one in the
-    configuration; None if the task learns from rewards.
+    """Return the teacher of a task's student, or None if the task learns from rewards. The teacher of a
+    resumed training is in its `checkpoint`. The configuration names the teacher of a new training.
 
     Raises:
         ConfigError: the teacher is missing or does not fit, or --teacher is given but the task learns from rewards.
@@ -185,7 +187,7 @@ def teacher_of(cfg: TaskConfig, checkpoint: Path | None, args: argparse.Namespac
 
 @dataclass
 class _Training:
-    """A training that is ready to run, in one of its processes. Only the first process has a run folder and a display."""
+    """The part of a training that one process runs. Only the first process has a run folder and a display."""
 
     args: argparse.Namespace
     cfg: TaskConfig
@@ -197,18 +199,18 @@ class _Training:
     """Time at which everything was built, on the clock of `time.perf_counter` [s]."""
 
     def evaluations(self) -> Evaluations:
-        """Return evaluations of the policy during the training, continued where the earlier training ended."""
+        """Return the evaluations of the policy during the training. A resumed training adds to the earlier evaluations."""
         evaluations = Evaluations(self.runner.env.cfg, TrainingEvaluation(self.runner.env))
         if self.resumed_from is not None:
             evaluations.go_on_from(self.resumed_from)
         return evaluations
 
     def learn(self, display: Display | None) -> tuple[Path | None, bool]:
-        """Train, and write to a new run folder; return the folder (None in all processes but the first), and True if the
-        training reached its end.
+        """Train, and write to a new run folder. Return the folder, and True if the training reached its end. All processes
+        but the first return None as the folder.
 
-        A training that fails before its first checkpoint leaves no folder. One that fails later writes the error and its
-        times into the folder.
+        A training that fails before its first checkpoint leaves no folder. A training that fails later writes the error and
+        the times of the training into the folder.
 
         Raises:
             RunError: the folder can't be written.
@@ -236,12 +238,12 @@ class _Training:
             discard_run(folder)
             if folder.is_dir():
                 said = "" if isinstance(error, KeyboardInterrupt) else f"{type(error).__name__}: {error}"
-                # The disk may be full, and a broken CUDA device has no name.
+                # RunError: the disk is full. RuntimeError: the CUDA device is broken, so its name can't be read.
                 with contextlib.suppress(RunError, RuntimeError):
                     write_timing(folder, self.timing(False, " ".join(said.split())[:500]))
                     self._report(folder, film=False)
             full = full_disk_in(error)
-            if full is not None and not isinstance(error, RunError):  # TensorBoard's writer does not name the file
+            if full is not None and not isinstance(error, RunError):  # an error of TensorBoard's writer names no file
                 raise RunError(f"{relative(folder)}: {reason(full)}") from error
             raise
 
@@ -275,7 +277,7 @@ class _Training:
         print(
             f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
             f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s"
-            f"{timing.company}), {timing.start_up_s:.1f} s of start-up, imports and kernel compilation included\n"
+            f"{timing.company}), {timing.start_up_s:.1f} s of start-up (with imports and kernel compilation)\n"
             f"checkpoint in {relative(folder)}; see it walk: {play_command(self.args, self.cfg, folder)}",
             flush=True,
         )
@@ -326,5 +328,5 @@ def play_command(args: argparse.Namespace, cfg: TaskConfig, folder: Path) -> str
 
 
 def _name_of(device: torch.device) -> str:
-    """Return the name of a device that is unique on this machine."""
+    """Return a device name that is unique on this machine."""
     return f"gpu-{torch.cuda.get_device_properties(device).uuid}" if device.type == "cuda" else "cpu"

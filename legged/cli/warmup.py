@@ -14,7 +14,7 @@ def warmup(args: argparse.Namespace) -> int:
     """Compile and cache the kernels of a task: `legged warmup anymal_c`.
 
     The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all kernels of the task for
-    this device, and the next training starts without compiling. C MuJoCo, the usual engine on a CPU, compiles no kernels.
+    this device, and the next training starts without compiling. C MuJoCo compiles no kernels.
     """
     register_given(args, "task")
     device = pick_device(args.sim_device)
@@ -24,5 +24,5 @@ def warmup(args: argparse.Namespace) -> int:
         return 0
     settle_on(device)
     make_task(cfg, device, graph=not args.no_graph)
-    print(f"{cfg.task}: ready in {time.perf_counter() - args.start_s:.1f} s, its kernels are in {kernel_cache()}")
+    print(f"{cfg.task}: ready in {time.perf_counter() - args.start_s:.1f} s; its kernels are in {kernel_cache()}")
     return 0

@@ -1,4 +1,4 @@
-"""Command-line arguments that several commands share, and the configuration that they describe."""
+"""Command-line arguments that several commands share, and functions that evaluate the parsed arguments."""
 
 import argparse
 import re
@@ -19,48 +19,48 @@ from legged.registry import YAML_ENDINGS, import_tasks, register_file
 TASK_HELP = "a task, e.g. anymal_c_flat, or its YAML file"
 POLICY_HELP = "a task (its newest run, else the shipped policy), its YAML file, a run, or a run's folder"
 OVERRIDE = re.compile(r"[\w.]+=")
-"""The beginning of a `key=value`; a text with a slash before the equals sign is a path."""
+"""Pattern of the beginning of an override `key=value`. A key has no slash, so a path such as `logs/a=b` does not match."""
 
 
 def _iteration(text: str) -> int | str:
-    """Return the iteration of a checkpoint, or `best`; argparse reports any other text."""
+    """Return the value of --checkpoint: an iteration, or `best`. For any other text, argparse prints the error."""
     try:
         return text if text == "best" else int(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (an iteration, or best)") from None
+        raise argparse.ArgumentTypeError(f"invalid value: '{text}' (allowed: an iteration, or best)") from None
 
 
 BUILD = (
     IMPORT,
     argument("--num-envs", type=int, help="number of robots (env.num_envs)"),
     argument("--seed", type=int, help="random seed (env.seed)"),
-    argument("--physics", metavar="ENGINE", help="mujoco_warp, mujoco or newton; by default the device decides"),
-    argument("--solver", metavar="NAME", help="solver of newton (sim.solver), e.g. xpbd; mujoco by default"),
-    argument("--sim-device", help="cpu or cuda[:i]; the GPU if there is one"),
+    argument("--physics", metavar="ENGINE", help="engine: mujoco_warp, mujoco or newton; by default chosen for the device"),
+    argument("--solver", metavar="NAME", help="solver of the engine newton (sim.solver), e.g. xpbd; by default mujoco"),
+    argument("--sim-device", help="cpu or cuda[:i]; by default the GPU if there is one (watch: the CPU)"),
     argument("--no-graph", action="store_true", help="run the step eagerly instead of as one CUDA graph"),
     argument("overrides", nargs="*", metavar="key=value", help="any setting, e.g. rewards.scales.torques=-1e-4"),
 )
-"""Arguments that determine how a task is built: --import, engine, devices, and `key=value` overrides."""
+"""Arguments that determine how a task is built, such as the engine, the device and `key=value` overrides."""
 TASK = (argument("task", metavar="TASK", help=TASK_HELP), *BUILD)
-"""The positional argument TASK, and those of `BUILD`."""
+"""The positional argument TASK, and the arguments of `BUILD`."""
 CHECKPOINT = argument("--checkpoint", type=_iteration, help="iteration of the checkpoint, or best; the latest by default")
 """The option that chooses among the checkpoints of a run."""
 POLICY = (argument("policy", metavar="POLICY", help=POLICY_HELP), CHECKPOINT, *BUILD)
 """The positional argument POLICY, --checkpoint, and the arguments of `BUILD`."""
 TILES = (
     argument("--terrain", metavar="TYPE", help="type of the tiles, e.g. stairs_up; by default the types of the task"),
-    argument("--difficulty", type=float, help="difficulty of the tiles, 0 to 1; by default 0.5, then 0.8 on the next tile"),
+    argument("--difficulty", type=float, help="difficulty of all tiles, 0 to 1; by default 0.5 in the first row, then 0.8"),
 )
 """Options that choose the tiles on which a policy is shown."""
 
 
 def of_legged_gym(name: str) -> tuple[Argument, ...]:
-    """Return the arguments that `train` and `play` share: the positional argument `name`, legged_gym's option --task that can
-    replace it, options that choose a run of the task, and the arguments of `BUILD`.
+    """Return the arguments that `train` and `play` share: the positional argument `name`, options that choose a run of the
+    task, and the arguments of `BUILD`. They also share legged_gym's option --task, which can replace the positional argument.
     """
     return (
         argument(name, nargs="?", metavar=name.upper(), help=TASK_HELP if name == "task" else POLICY_HELP),
-        argument("--task", dest="task_option", metavar="TASK", help=f"the same as {name.upper()}, as in legged_gym"),
+        argument("--task", dest="task_option", metavar="TASK", help=f"legged_gym's way to give the argument {name.upper()}"),
         argument("--experiment-name", help="folder under logs/; the task's name by default"),
         argument("--load-run", metavar="RUN", help="a run of the task, by name or folder; the newest by default"),
         CHECKPOINT,
@@ -94,10 +94,11 @@ def override_is_no_name(args: argparse.Namespace, name: str) -> None:
 
 
 def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
-    """Return all overrides of a command line, first those of the form `key=value`, then those of flags.
+    """Return all overrides of a command line as (dotted path, value). Overrides of the form `key=value` come first, and then
+    those of flags such as --seed.
 
     Raises:
-        ConfigError: a text is not of the form `key=value`, or --solver is given for another engine than newton.
+        ConfigError: a text is not of the form `key=value`, or --solver is given without the engine newton.
     """
     flags = {
         "num_envs": "env.num_envs",
@@ -115,7 +116,7 @@ def overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     found += [(key, value) for key, value in given.items() if value is not None]
     engine = dict(found).get("sim.physics")
     if args.solver is not None and engine != "newton":
-        raise ConfigError(f"--solver: '{args.solver}' is an option of newton; add --physics newton (got {engine})")
+        raise ConfigError(f"--solver: '{args.solver}' is a solver of the engine newton; add --physics newton (got {engine})")
     return found
 
 
@@ -123,7 +124,7 @@ def policy_overrides(args: argparse.Namespace) -> list[tuple[str, Any]]:
     """Return all overrides except the experiment name, which chooses the run of a policy.
 
     Raises:
-        ConfigError: as `overrides`.
+        ConfigError: as for `overrides`.
     """
     return [change for change in overrides(args) if change[0] != "train.runner.experiment_name"]
 
@@ -139,7 +140,7 @@ def velocity_command(text: str) -> tuple[float, float, float]:
     except ValueError:
         vx = vy = yaw = float("nan")
     if not all(abs(value) <= 100.0 for value in (vx, vy, yaw)):
-        raise ConfigError(f"--command: expected three numbers of at most 100 like 0.5,0,0.2, got '{text}'")
+        raise ConfigError(f"--command: expected three numbers from -100 to 100 like 0.5,0,0.2; got '{text}'")
     return vx, vy, yaw
 
 
@@ -182,15 +183,15 @@ def settle_on(device: torch.device) -> None:
         # The C engine uses all cores. If torch's threads compete for them, operations on small tensors become slower.
         torch.set_num_threads(1)
     else:
-        torch.cuda.set_device(device)  # operations that name no device must not run on the first GPU
+        torch.cuda.set_device(device)  # otherwise, operations without an explicit device would run on the first GPU
 
 
 def measuring_device(args: argparse.Namespace) -> torch.device:
-    """Return the device of a command that measures a policy, and configure torch for it. Without --sim-device it is the CPU
-    for `--physics mujoco`, else the GPU if there is one.
+    """Return the device of a command that measures a policy, and configure torch for this device. Without --sim-device,
+    `--physics mujoco` uses the CPU, and all other engines use the GPU if there is one.
 
     Raises:
-        ConfigError: as `pick_device`.
+        ConfigError: as for `pick_device`.
     """
     device = torch.device("cpu") if args.physics == "mujoco" and args.sim_device is None else pick_device(args.sim_device)
     settle_on(device)
@@ -205,7 +206,7 @@ def watch_command(args: argparse.Namespace, folder: Path) -> str:
 
 
 def given_import(args: argparse.Namespace) -> list[str]:
-    """Return the option --import for another command that is to know the user-defined tasks of this command."""
+    """Return the option --import as words for another command that needs the user-defined tasks of this command."""
     files = [file for file in (args.module, args.task_file) if file]
     return ["--import", ",".join(files)] if files else []
 

@@ -41,11 +41,11 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "
 
 
 def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = None) -> int:
-    """Run a command, with the arguments of this process if `argv` is None; return its exit code.
+    """Run a command and return its exit code. If `argv` is None, the command gets the arguments of this process.
 
-    The codes are 0 for success, 1 for a command that could not go on, 2 for wrong input, and 130 after Ctrl-C. The reason is
-    printed in one line; only a fault of the program prints a traceback. If standard output is lost, the command goes on and
-    still writes its files, and the code is 1.
+    The exit code is 0 for success, 1 for a command that failed, 2 for wrong input, and 130 after Ctrl-C. The reason for a
+    failure is printed in one line; only a bug prints a traceback. If writing to standard output fails, e.g. because a pipe
+    was closed, the command goes on and still writes its files. The exit code is then 1 instead of 0.
     """
     if argv is None:
         is_a_command()
@@ -54,7 +54,7 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         leaves = None
         try:
             code = _guarded(main, argv)
-        except SystemExit as stop:  # argparse raises it after --help or a wrong flag
+        except SystemExit as stop:  # argparse raises SystemExit after --help or a wrong flag
             leaves, code = stop, stop.code if isinstance(stop.code, int) else 0
         output.flush()
         if output.lost is not None:
@@ -63,12 +63,12 @@ def run_main(main: Callable[[list[str] | None], int], argv: list[str] | None = N
         elif leaves is not None:
             raise leaves
     if argv is None:
-        leave_at_interrupts()  # no traceback if Ctrl-C comes while Python ends
+        leave_at_interrupts()  # from here on, Ctrl-C prints no traceback
     return code
 
 
 def _engine_warnings() -> AbstractContextManager[None]:
-    """Return a context in which each kind of MuJoCo's warnings is printed once, if MuJoCo is imported."""
+    """Return a context that prints each kind of MuJoCo warning once. If MuJoCo is not imported, the context does nothing."""
     if "mujoco" not in sys.modules:
         return nullcontext()
     from legged.physics.engine_warnings import each_warning_once
@@ -77,11 +77,12 @@ def _engine_warnings() -> AbstractContextManager[None]:
 
 
 class SubCommand:
-    """A command that parses its arguments and calls a function with them. It is called `legged <module> <function>`, or
-    `legged <module>` if both have the same name. A `_` in a name becomes a hyphen, and a `_` at the end is left out.
+    """A command that parses its arguments and calls a function with them. Users type `legged <module> <function>`, or
+    `legged <module>` if the two names are equal. A `_` in a name becomes a hyphen; a `_` at the end of a name is left out.
 
-    The arguments also have `words`, the list of words of the command line, and `start_s`, the start of the command on the
-    clock of `time.perf_counter` [s]. If the command is the whole process, `start_s` is before the imports.
+    The parsed arguments have two more attributes. `words` is the list of words of the command line. `start_s` is the time at
+    which the command started, on the clock of `time.perf_counter` [s]. If the command runs as its own process, this is the
+    time before the imports.
     """
 
     def __init__(self, run: Callable[..., int], examples: Sequence[str], arguments: Sequence[Argument]) -> None:
@@ -95,14 +96,14 @@ class SubCommand:
         return CommandParser(" ".join(["legged", *words]), described, *self._examples, arguments=self._arguments)
 
     def parse(self, argv: list[str] | None) -> argparse.Namespace:
-        """Return the parsed arguments of the command line `argv`, or of this process if it is None."""
+        """Parse the command line `argv`, or the arguments of this process if `argv` is None. Return the parsed arguments."""
         args = self.build_parser().parse_intermixed_args(argv)
         args.words = sys.argv[1:] if argv is None else argv
         args.start_s = STARTED_S if argv is None else time.perf_counter()
         return args  # type: ignore[no-any-return]
 
     def main(self, argv: list[str] | None = None) -> int:
-        """Run the command with the arguments `argv`, or those of this process if it is None; return the exit code."""
+        """Run the command and return its exit code. If `argv` is None, the command gets the arguments of this process."""
         return run_main(lambda words: self.run(self.parse(words)), argv)
 
 
@@ -114,7 +115,7 @@ def sub_command(*examples: str, arguments: Sequence[Argument] = ()) -> Callable[
 
 
 def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) -> int:
-    """Run a command; return its exit code, however it ends."""
+    """Run a command and return its exit code. Known errors are printed; an error that looks like a bug is raised again."""
     try:
         return main(argv)
     except ConfigError as error:
@@ -136,7 +137,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
             return INTERRUPTED
         text = known_failure(error)
         if text is None:
-            from legged.user_modules import is_of_a_module  # imported late, because help and lists do not need it
+            from legged.user_modules import is_of_a_module  # a late import, because `legged --help` must stay fast
 
             if not is_of_a_module(_file_of(error)):
                 raise
@@ -147,7 +148,7 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
 
 
 def line_of_user(error: BaseException | None) -> str:
-    """Return ' (file, line n)' of the innermost line of user code in the tracebacks of `error` and its causes, or ''."""
+    """Return ' (file, line n)' for the innermost line of user code in the tracebacks of `error` and its causes, else ''."""
     frames: list[traceback.FrameSummary] = []
     while error is not None:
         frames += traceback.extract_tb(error.__traceback__)
@@ -157,7 +158,7 @@ def line_of_user(error: BaseException | None) -> str:
 
 
 def _file_of(error: BaseException) -> str:
-    """Return the file in which an error was raised, or the file that reads an attribute if a `__getattr__` raised it."""
+    """Return the file that raised an error. If a `__getattr__` raised the error, return the file that read the attribute."""
     frames = traceback.extract_tb(error.__traceback__)
     while len(frames) > 1 and frames[-1].name == "__getattr__":
         frames.pop()
@@ -171,8 +172,8 @@ def _is_of_user(file: Path) -> bool:
 
 
 def known_failure(error: BaseException) -> str | None:
-    """Return one line about a full disk, a file that can't be written or too little memory, whatever library reported it;
-    None for all other errors.
+    """Return a one-line message if `error` means a full disk, a file that can't be opened or written, or too little memory.
+    Return None for all other errors.
     """
     failed = full_disk_in(error)
     if failed is None and isinstance(error, OSError):
@@ -188,7 +189,7 @@ def _say(text: str) -> None:
     """Print the reason why the command ends."""
     try:
         rank = f"rank {Ranks.now().rank}: " if Ranks.now().several else ""
-    except ConfigError:  # the error to print may be about the rank itself
+    except ConfigError:  # the rank in the environment is invalid; `text` must be printed without it
         rank = ""
     print(f"{rank}error: {text}", file=sys.stderr, flush=True)
 
@@ -197,10 +198,10 @@ def _say(text: str) -> None:
 
 
 class Output:
-    """A text stream that discards text once writing has failed."""
+    """A text stream that discards text after a write has failed."""
 
     def __init__(self, stream: TextIO | None) -> None:
-        """Wrap `stream`, which is None in a process that was started without one."""
+        """Wrap `stream`, e.g. standard output. `stream` is None in a process that was started without standard output."""
         self._stream = open(os.devnull, "w") if stream is None else stream  # noqa: SIM115  (open until the process ends)
         self.lost: str | None = None
         """Reason why nothing more can be written; None while writing works."""
@@ -220,7 +221,7 @@ class Output:
                 self._stream.flush()
 
     def when_lost(self, do: Callable[[], object]) -> None:
-        """Call `do` as soon as nothing can be written any more; at once, if writing already fails."""
+        """Call `do` as soon as writing fails. If writing has already failed, call `do` at once."""
         if self.lost is not None:
             do()
         self._when_lost.append(do)
@@ -229,11 +230,11 @@ class Output:
     def _watched(self) -> Iterator[None]:
         try:
             yield
-        except UnicodeError:  # the terminal's encoding lacks a character
+        except UnicodeError:  # the stream works, but its encoding lacks a character
             raise
-        except (OSError, ValueError) as error:  # ValueError: the stream was closed
+        except (OSError, ValueError) as error:  # a closed stream raises ValueError
             self.lost = _why(error)
-            if self._stream in (sys.__stdout__, sys.__stderr__):  # at exit Python writes its buffer, which must not fail
+            if self._stream in (sys.__stdout__, sys.__stderr__):  # a flush at Python's exit must not fail
                 with suppress(OSError, ValueError):
                     nowhere = os.open(os.devnull, os.O_WRONLY)
                     os.dup2(nowhere, self._stream.fileno())
@@ -242,7 +243,7 @@ class Output:
                 do()
 
     def __getattr__(self, name: str) -> Any:
-        """Return any other attribute of the text stream."""
+        """Return the attribute `name` of the wrapped stream. Python calls this only for names that this class lacks."""
         return getattr(self._stream, name)
 
 
@@ -253,14 +254,14 @@ def _why(error: OSError | ValueError) -> str:
 
 
 def when_output_is_lost(do: Callable[[], object]) -> None:
-    """Call `do` once nothing can be written to standard output any more. Outside of a command it is never called."""
+    """Call `do` as soon as writing to standard output fails. Outside of a command, `do` is never called."""
     if isinstance(sys.stdout, Output):
         sys.stdout.when_lost(do)
 
 
 @contextmanager
 def forgiving_output() -> Iterator[Output]:
-    """Discard text once it can't be written to standard output or standard error; yield the wrapped standard output."""
+    """Replace stdout and stderr by streams that discard text after a failed write. Yield the new stdout."""
     streams = sys.stdout, sys.stderr
     output = Output(sys.stdout)
     sys.stdout, sys.stderr = output, Output(sys.stderr)  # type: ignore[assignment]
@@ -277,12 +278,12 @@ def forgiving_output() -> Iterator[Output]:
 
 @contextmanager
 def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Call `stop` at the first signal, so that a training ends after its iteration. Raise KeyboardInterrupt at the second.
-    Yield a list to which received signals are appended. The earlier handlers are restored afterwards.
+    """Call `stop` at the first signal, so that a training ends after the current iteration. Raise KeyboardInterrupt at the
+    second signal. Yield a list to which received signals are appended. The earlier handlers are restored afterwards.
 
-    With several processes, all stop as soon as one receives a signal, and a second signal has no effect: it may be the same
-    Ctrl-C, which the terminal sends to each process and torchrun sends again. torchrun kills processes that take more than
-    half a minute to end. Outside the main thread signals keep their handlers, because Python can't set others there.
+    In a training with several processes, a signal to one process stops all processes. A second signal has no effect there,
+    because one Ctrl-C arrives twice: from the terminal and from torchrun. torchrun kills processes that take more than half a
+    minute to end. Outside the main thread no handlers are set, because Python refuses to set them.
     """
     received: list[int] = []
     ranks = Ranks.now()
@@ -292,8 +293,8 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
         if len(received) > 1 and not ranks.several:
             raise KeyboardInterrupt
         if len(received) == 1 and ranks.first:
-            once_more = "" if ranks.several else "; a second signal stops it at once"
-            with suppress(RuntimeError):  # the signal came during another write to the same stream
+            once_more = "" if ranks.several else "; a second signal ends the training now"
+            with suppress(RuntimeError):  # a print during another write to the same stream raises RuntimeError
                 print(f"stopping after this iteration, with a checkpoint{once_more}", file=sys.stderr, flush=True)
         stop()
 
@@ -309,8 +310,8 @@ def stopping_on_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
 
 @contextmanager
 def quiet_writers() -> Iterator[None]:
-    """Keep writer threads from printing a traceback when they cannot write a file; TensorBoard's writer raises the same error
-    again in the caller.
+    """Print no traceback for a thread that ends with an OSError, such as TensorBoard's writer thread on a full disk. The next
+    call to TensorBoard's writer raises the same error in the calling thread.
     """
     before = threading.excepthook
 

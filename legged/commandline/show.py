@@ -1,4 +1,4 @@
-"""Summary of a configuration for `--show`: terms with their columns, actions and joints."""
+"""Summary of a configuration for `--show`: tables of observations, rewards, terminations, actions and joints."""
 
 import inspect
 from collections.abc import Iterator
@@ -22,8 +22,8 @@ ALONE = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.threads", 1), ("t
 
 
 def summary(cfg: TaskConfig) -> list[str]:
-    """Return lines about a task, which is built with one robot on the C engine. Each line begins with '#', so that the lines
-    may follow a configuration in YAML.
+    """Build the task that `cfg` configures, with one robot on the C engine, and return lines that describe the task. Each
+    line begins with '#', so that the lines may follow a configuration in YAML.
 
     Raises:
         ConfigError: the task cannot be built.
@@ -43,7 +43,7 @@ def _says(task: BaseTask, method: str) -> str:
 
 
 def _table(title: str, *rows: tuple[str, ...]) -> Iterator[str]:
-    """Yield a title and rows in columns; the last column is not padded."""
+    """Yield the lines of a table: an empty line, the title, and the rows with aligned columns."""
     yield from ("", title)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths[-1] = 0
@@ -108,7 +108,7 @@ def _terminations(task: BaseTask) -> Iterator[str]:
 
 
 def _randomisation(task: BaseTask) -> Iterator[str]:
-    """Yield two tables: randomised properties, also by settings with legged_gym's names, and disturbances."""
+    """Yield two tables: randomised properties and disturbances. Settings with legged_gym's names are included."""
     rand, draws = task.cfg.domain_rand, task.randomization.draws
     drawn = {name: (draw, task.randomization.is_each(name)) for name, draw in draws.items()}
     pushes: list[tuple[str, str, str]] = []
@@ -142,7 +142,7 @@ def _grown(grow: tuple[float, float]) -> str:
 
 
 def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
-    """Yield name, size and times of each disturbance."""
+    """Yield for each disturbance its name, its size, and when it acts."""
     if rand.push_robots:
         size = f"sets the base's horizontal velocity, x and y +-{_number(rand.max_push_vel_xy)} m/s"
         yield "push_robots", size, f"every {_number(rand.push_interval_s)} s"
@@ -171,7 +171,7 @@ def _effect(task: BaseTask, i: int) -> str:
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
     bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
-    # Only the force of a motor on a joint is a fixed multiple of the control.
+    # Only a joint's motor (fixed gain, no bias) has a force proportional to the control. Else the text gives the control.
     if not on_joint or not gains or bias:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])

@@ -1,7 +1,8 @@
-"""Bounds of the schema's numbers. A value beyond them is a typing mistake and would overflow or fill the memory.
+"""Bounds of the schema's numbers. A value beyond its bounds is most likely a typo. It would cause an overflow or fill the
+memory.
 
-Bounds hold for every item of a list and every value of a map. A list with bounds must not be empty, unless its bounds allow
-it.
+Bounds hold for every item of a list and every value of a map. A list with bounds must not be empty, unless the bounds
+contain `may_be_empty`.
 """
 
 from typing import Any
@@ -11,7 +12,7 @@ Bounds = dict[str, Any]
 FLOAT32_MAX = 3.4e38
 """Largest number in any setting, because tensors are float32."""
 SMALLEST = 1e-9
-"""Smallest value of a positive quantity, because many are divisors."""
+"""Smallest value of a positive quantity. Many such quantities are divisors, and a smaller divisor could cause an overflow."""
 LONGEST_S = 1e9
 """Longest time [s]. An event with this interval never happens in practice."""
 LARGEST = 1e6
@@ -34,18 +35,18 @@ def items(most: int, bounds: Bounds | None = None) -> Bounds:
 
 
 def quantity(unit: str, bounds: Bounds) -> Bounds:
-    """Return metadata of a quantity of `unit`, within `bounds`."""
+    """Return metadata of a quantity in the unit `unit`, within `bounds`."""
     return {**bounds, "unit": unit}
 
 
 def rescaled(unit: str, bounds: Bounds) -> Bounds:
-    """Return metadata of a quantity of `unit`, within `bounds`, that is rescaled for another robot (rescale.py)."""
+    """Return metadata like `quantity`, for a quantity that is rescaled for another robot (rescale.py)."""
     return {**quantity(unit, bounds), "rescaled": unit}
 
 
 def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
-    """Return metadata of a map: term -> number. Numbers are rescaled for another robot. A number has the unit of the method
-    `<prefix><term>`, raised to `power`.
+    """Return metadata of a map: term -> number. The numbers are rescaled for another robot. The unit of a number is the unit
+    that the method `<prefix><term>` declares, raised to `power`.
     """
     return {**bounds, "unit_of": (prefix, power)}
 
@@ -57,9 +58,9 @@ def rescaled_by_entry(path: str, bounds: Bounds) -> Bounds:
 
 UNIT = between(0, 1)
 NAME: Bounds = {"name": True}
-"""Name of a folder; it may be empty."""
+"""Metadata of a text that is the name of a folder. The text may be empty."""
 NAMES = items(1000)
-"""List of texts without duplicates. It must not be empty."""
+"""Metadata of a list of texts without duplicates. The list must not be empty."""
 NAMES["unique"] = True
 TERMS: Bounds = {**NAMES, "may_be_empty": True}
-"""List of texts without duplicates. It may be empty."""
+"""Metadata of a list of texts without duplicates. The list may be empty."""

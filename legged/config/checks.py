@@ -1,5 +1,5 @@
-"""Conversion of plain values to an instance of a schema, field by field. Every error names the source of the value, such as a
-file, and its dotted path.
+"""Conversion of plain values to an instance of a schema, field by field. Every error names the dotted path of the value, and
+the source of the value, such as a file.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ T = TypeVar("T")
 LONGEST_NAME = 100
 """Longest name of a folder, in characters."""
 DEEPEST = 30
-"""Deepest nesting of sections and lists in the free part of a configuration."""
+"""Deepest allowed nesting of maps and lists in a configuration."""
 SHOWN = 80
 """Longest text of a value in an error, in characters."""
 PLAIN = "a plain name: no path separators, not '..', no leading '.', no control characters, at most 100 letters"
@@ -55,7 +55,7 @@ def is_plain_name(name: str) -> bool:
 
 def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, base: T | None = None) -> T:
     """Build an instance of the dataclass `schema` from the mapping `data`, and check every field. A field that is missing in
-    `data` keeps its value in `base` or, without `base`, its default.
+    `data` gets the value that it has in `base`. If `base` is None, the field gets its default.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
@@ -91,15 +91,17 @@ def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, 
 def _build_entries(
     schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Build the sections in a map. A field that a section lacks keeps its value in the section of that name in `entries`."""
-    names = _check(dict[str, object], data, path, origins, source)  # `build` checks the values
+    """Build each section of the map `data`. A field that a section lacks gets its value from the section with the same name
+    in `entries`, or its default if `entries` has no such section.
+    """
+    names = _check(dict[str, object], data, path, origins, source)  # only keys are checked here; `build` checks the values
     return {
         name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
     }
 
 
 def _origin(path: str, origins: Origins, source: str) -> str:
-    """Return the recorded source of the value at `path`, else `source`."""
+    """Return the source that `origins` records for `path`. If `origins` or `path` is empty, return `source`."""
     return origins.of(path) if path and origins else source
 
 
@@ -166,7 +168,7 @@ def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> A
             raise fail("a mapping")
         for key in value:
             if not isinstance(key, str):
-                raise fail(f"text for a key, not {shown(key)}")
+                raise fail(f"a mapping whose keys are text (one key is {shown(key)})")
         return {k: _check(args[1], v, f"{path}.{plain_path(k)}", origins, source) for k, v in value.items()}
     if kind is bool:
         if not isinstance(value, bool):
@@ -194,29 +196,29 @@ def _number(value: float, fail: Any) -> float:
     except OverflowError:
         number = math.inf
     if math.isinf(number):
-        raise fail(f"a finite number, at most {FLOAT32_MAX:g} in size")
-    return number  # the field's bounds are checked next
+        raise fail(f"a finite number, from -{FLOAT32_MAX:g} to {FLOAT32_MAX:g}")
+    return number  # `build` checks the field's bounds later
 
 
 def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
-    """Return a copy of a value in the free part of a configuration. It may be anything that YAML can write and read, except
-    NaN and infinite numbers.
+    """Return a copy of a value whose field has the type `Any`, e.g. in the section `custom`. The value may be anything that
+    YAML can write and read, except NaN and infinite numbers.
     """
     if depth > DEEPEST:
         raise fail(f"at most {DEEPEST} nested maps and lists")
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str | int):
-                raise fail(f"text for a key, not {shown(key)}")
+                raise fail(f"a mapping whose keys are text or whole numbers (one key is {shown(key)})")
         return {key: _check_free(item, fail, depth + 1) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_check_free(item, fail, depth + 1) for item in value]
     if isinstance(value, int | float) and not isinstance(value, bool):
         if value != value or not abs(value) <= FLOAT32_MAX:
-            raise fail(f"finite numbers, at most {FLOAT32_MAX:g} in size")
-        return int(value) if isinstance(value, int) else float(value)  # YAML has no NumPy numbers
+            raise fail(f"finite numbers, from -{FLOAT32_MAX:g} to {FLOAT32_MAX:g}")
+        return int(value) if isinstance(value, int) else float(value)  # YAML can't write NumPy numbers
     elif value is not None and not isinstance(value, bool | str):
-        raise fail("numbers, texts, true, false, null, lists and maps of them")
+        raise fail("a number, a text, true, false, null, or a list or map of these")
     return value
 
 

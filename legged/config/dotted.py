@@ -21,7 +21,7 @@ def value_at(values: Any, path: str) -> Any:
 
 
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
-    """Return dotted path -> value for all settings. A list is one value, and so is an empty mapping."""
+    """Return dotted path -> value for all settings. A list or an empty mapping counts as one value."""
     if not isinstance(config, Mapping) or (not config and prefix):
         return {prefix: config}
     return {
@@ -30,8 +30,8 @@ def flat(config: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def differences(configs: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return the settings that differ: dotted path -> value in each configuration, MISSING where a configuration lacks it. If
-    a mapping is empty in one configuration and has settings in another, only these settings are compared.
+    """Return the settings that differ: dotted path -> list of the values in all `configs`. The value is MISSING where a
+    configuration lacks the setting. An empty mapping is not compared if the mapping has settings in another configuration.
     """
     all_flat = [flat(config) for config in configs]
     paths = dict.fromkeys(path for one in all_flat for path in one)

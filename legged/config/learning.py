@@ -11,25 +11,25 @@ HIDDEN = items(64, between(1, 16384))
 @dataclass(frozen=True)
 class EstimatorConfig:
     """Estimator of quantities that only the simulator knows. It reads the policy's observations, and is trained by
-    supervision in every iteration (Ji et al., arXiv 2202.05481). The policy reads the estimates in addition to its
+    supervised learning in every iteration (Ji et al., arXiv 2202.05481). The policy reads the estimates in addition to its
     observations.
     """
 
     targets: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Observation terms to estimate, scaled and without noise; empty for no estimator."""
+    """Observation terms to estimate. The targets are the scaled terms without noise. An empty list means no estimator."""
     hidden_dims: tuple[int, ...] = field(default=(256, 128), metadata=HIDDEN)
     """Widths of the estimator's hidden layers."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
-    """Learning rate of the estimator, which is constant."""
+    """Constant learning rate of the estimator."""
     latent: int = field(default=0, metadata=between(0, 16384))
-    """Number of outputs in addition to the estimates. They have no targets, and the policy's gradient trains them."""
+    """Number of outputs in addition to the estimates. These outputs have no targets; the policy's gradient trains them."""
     policy_gradient: bool = False
-    """Train the estimates by the policy's gradient too; otherwise by the targets alone."""
+    """Train the estimates with their targets and with the policy's gradient; otherwise only with their targets."""
 
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """Networks of actor and critic. With `rnn_type`, `rnn_num_layers` recurrent layers come before the hidden layers."""
+    """Networks of actor and critic. Unless `rnn_type` is `none`, recurrent layers come before the hidden layers."""
 
     actor_observations: tuple[str, ...] = field(default=("actor",), metadata=NAMES)
     """Observation groups that the policy reads, concatenated in this order."""
@@ -40,21 +40,21 @@ class PolicyConfig:
     critic_hidden_dims: tuple[int, ...] = field(default=(512, 256, 128), metadata=HIDDEN)
     """Widths of the value function's hidden layers."""
     activation: Literal["elu", "selu", "relu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish"] = "elu"
-    """Activation function, by rsl-rl's names."""
+    """Name of the activation function in rsl-rl."""
     init_noise_std: float = field(default=1.0, metadata=positive(1000, low=1e-6))
     """Standard deviation of the actions before training."""
     min_noise_std: float = field(default=1e-6, metadata=positive(1000, low=1e-6))
-    """Smallest standard deviation of the actions. It keeps up exploration if the entropy would collapse."""
+    """Smallest standard deviation of the actions. A larger value keeps the policy exploring until the end of training."""
     max_noise_std: float = field(default=1e6, metadata=positive(1e6, low=1e-6))
     """Largest standard deviation of the actions."""
     noise_std_type: Literal["scalar", "log"] = "scalar"
-    """Learned parameter of the noise: the standard deviation itself, or its logarithm."""
+    """Parameter that training learns for the noise: the standard deviation (`scalar`) or its logarithm (`log`)."""
     state_dependent_std: bool = False
-    """Let the policy compute the standard deviation for each state; otherwise it is one number per action."""
+    """Let the policy compute the standard deviation from its observations. Otherwise each action has one learned value."""
     obs_normalization: bool = False
     """Normalise observations by their running mean and variance."""
     rnn_type: Literal["none", "lstm", "gru"] = "none"
-    """Type of recurrent layers, whose hidden state lasts an episode; `none` for a policy without memory."""
+    """Type of the recurrent layers; `none` for a policy without memory. Every episode begins with a zero hidden state."""
     rnn_hidden_dim: int = field(default=256, metadata=between(1, 16384))
     """Width of a recurrent layer."""
     rnn_num_layers: int = field(default=1, metadata=between(1, 64))
@@ -65,71 +65,71 @@ class PolicyConfig:
 
 @dataclass(frozen=True)
 class AlgorithmConfig:
-    """Settings of PPO, by rsl-rl's names. Distillation has its own section, and uses only `optimizer` and
-    `use_mixed_precision` of this one.
+    """Settings of PPO, mostly with rsl-rl's names. Distillation has its own section (DistillationConfig). Of the
+    settings here, Distillation uses only `optimizer` and `use_mixed_precision`.
     """
 
     class_name: Literal["PPO", "Distillation"] = "PPO"
-    """Learning algorithm: `PPO` from rewards, or `Distillation` from a teacher (train.distillation)."""
+    """Learning algorithm. `PPO` learns from rewards, `Distillation` learns from a teacher (train.distillation)."""
     value_loss_coef: float = field(default=1.0, metadata=between(0, 1000))
     """Weight of the value function's error in the loss."""
     use_clipped_value_loss: bool = True
-    """Limit the change of the value function by clip_param, like the change of the policy."""
+    """In the loss of the value function, clip the change of the predicted values to +/- clip_param."""
     clip_param: float = field(default=0.2, metadata=positive(100, low=1e-6))
-    """The ratio of an action's new to its old probability is clipped between 1 - clip_param and 1 + clip_param."""
+    """The ratio (new probability of an action / old probability) is clipped between 1 - clip_param and 1 + clip_param."""
     entropy_coef: float = field(default=0.01, metadata=between(0, 100))
-    """Weight of the entropy in the loss. A larger weight keeps up exploration."""
+    """Weight of the entropy in the loss. A larger weight increases exploration."""
     num_learning_epochs: int = field(default=5, metadata=between(1, 1000))
     """Number of passes over the samples of an iteration."""
     num_mini_batches: int = field(default=4, metadata=between(1, 1_000_000))
     """Number of mini-batches in a pass over the samples. Each mini-batch gives one gradient step."""
     optimizer: Literal["adam", "adamw", "sgd", "rmsprop"] = "adam"
-    """Optimiser, by torch's names."""
+    """Name of the optimiser in torch."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
     """Learning rate; the initial one if `schedule` is `adaptive`."""
     schedule: Literal["adaptive", "fixed"] = "adaptive"
-    """Schedule of the learning rate: `adaptive` changes it so that the policy changes by desired_kl, `fixed` keeps it
-    constant."""
+    """Schedule of the learning rate: `adaptive` changes the rate to keep the KL divergence near desired_kl, `fixed`
+    keeps the rate constant."""
     gamma: float = field(default=0.99, metadata=UNIT)
     """Discount of rewards, per control step."""
     lam: float = field(default=0.95, metadata=UNIT)
     """Lambda of generalised advantage estimation."""
     desired_kl: float = field(default=0.01, metadata=positive(100))
-    """KL divergence between successive policies that the `adaptive` schedule aims at."""
+    """Target of the `adaptive` schedule: KL divergence from the policy that acted to the policy after the update."""
     max_grad_norm: float = field(default=1.0, metadata=positive(1e9))
     """Norm at which gradients are clipped."""
     reward_scale: float = field(default=1.0, metadata=positive(1e6, low=1e-9))
-    """Factor on rewards before the learner uses them. Logs and results show unscaled rewards."""
+    """Factor by which rewards are multiplied before the learner uses them. Logs and results show unscaled rewards."""
     normalize_advantage_per_mini_batch: bool = False
     """Normalise advantages over each mini-batch; otherwise over all samples of an iteration."""
     use_mixed_precision: bool = False
     """Compute networks in bfloat16 during an update. Weights, losses and the optimiser stay in float32."""
     symmetry: bool = False
-    """Learn from every sample and its mirror image, left for right (Mittal et al., arXiv 2403.04359)."""
+    """Learn from every sample and from its mirror image, with left and right exchanged (Mittal et al., arXiv 2403.04359)."""
     mirror_loss_coeff: float = field(default=0.0, metadata=between(0, 1000))
-    """Weight of the mirror loss, which needs `symmetry`; 0 switches it off. The loss is the squared difference between the
-    actions for a mirrored observation and the mirrored actions."""
+    """Weight of the mirror loss; 0 switches the loss off. The loss needs `symmetry`. It is the squared difference between
+    the actions for the mirrored observation and the mirrored actions for the original observation."""
     critic_warmup_iterations: int = field(default=0, metadata=between(0, 1_000_000_000))
-    """Number of iterations at the start in which the value function learns alone. The policy, its standard deviation and its
-    normaliser stay constant. With this setting, `--transfer` loads only the policy, and starts with a new value function,
-    optimiser and standard deviation."""
+    """Number of iterations at the start of training that change only the value function. In these iterations the policy, its
+    standard deviation and its normaliser stay constant. With a number above 0, `--transfer` loads only the policy. The value
+    function, the optimiser and the standard deviation then start anew."""
 
 
 @dataclass(frozen=True)
 class DistillationConfig:
-    """Settings of distillation, by rsl-rl's names. A student acts, and learns the actions that its teacher would have taken
-    (Ross et al., arXiv 1011.0686).
+    """Settings of distillation, mostly with rsl-rl's names. A student acts, and learns the actions that its teacher would
+    have taken (Ross et al., arXiv 1011.0686).
     """
 
     teacher: str = ""
     """Teacher: a run folder, an experiment under logs/, a checkpoint, or a task with a shipped policy. `--teacher` sets
     it."""
     loss_type: Literal["mse", "huber"] = "mse"
-    """Loss of the difference between the mean actions of student and teacher: squared (`mse`), or squared up to 1 and linear
-    beyond (`huber`)."""
+    """Loss on the difference between the actions of student and teacher, both without exploration. `mse`: the squared
+    difference. `huber`: squared for differences up to 1, linear for larger ones."""
     gradient_length: int = field(default=8, metadata=between(1, 100_000))
-    """Number of control steps, of all robots, that each gradient step uses. In a recurrent student the gradient flows back
-    through all of them. Must divide train.runner.num_steps_per_env."""
+    """Number of successive control steps that each gradient step uses, for all robots. In a recurrent student the gradient
+    flows back through all these steps. The number must divide train.runner.num_steps_per_env."""
     num_learning_epochs: int = field(default=2, metadata=between(1, 1000))
     """Number of passes over the steps of an iteration."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
@@ -140,7 +140,7 @@ class DistillationConfig:
 
 @dataclass(frozen=True)
 class RunnerConfig:
-    """Settings of the length of training, of evaluations during training, and of the files that it writes."""
+    """Settings of a training run: its length, the evaluations during training, and the files that the run writes."""
 
     num_steps_per_env: int = field(default=24, metadata=between(1, 100_000))
     """Control steps of each robot per iteration."""
@@ -152,25 +152,25 @@ class RunnerConfig:
     """Iterations between two evaluations during training; 0 for no evaluations. An evaluation measures the policy without
     exploration, on separate robots without disturbances."""
     evaluate_share: float = field(default=0.03, metadata=UNIT)
-    """Largest share of the iterations' time that evaluations during training may take. An evaluation that would exceed this
-    share is skipped, except the first and the last; 1 skips none."""
+    """Largest share of the iterations' time that evaluations during training may take. Evaluations that would exceed this
+    share are skipped, except the first and the last one. With a share of 1, no evaluation is skipped."""
     evaluate_envs: int = field(default=256, metadata=between(1, 2**20))
-    """Largest number of robots of an evaluation during training. The commands of the task's grid are distributed over
-    them."""
+    """Largest number of robots in an evaluation during training. In a task with commands, each robot follows one
+    command of the task's grid (evaluation.vx, vy and yaw)."""
     evaluate_s: float = field(default=0.0, metadata=quantity("s", between(0, LONGEST_S)))
     """Simulated time of an evaluation during training [s]. 0 means 3 s or, in tasks without commands, a whole episode."""
     best_by: str = ""
-    """Figure of the evaluations during training that selects model_best.pt; empty for lin_vel_rmse, or for the return in
-    tasks without commands."""
+    """Name of the evaluation result that selects model_best.pt. Empty means `lin_vel_rmse`, or, in tasks without commands,
+    `return`."""
     stop_at: dict[str, float] = field(default_factory=dict, metadata=between(-1e12, 1e12))
-    """Figure of the evaluations during training -> its target. Training ends when all targets are reached. `falls` and
-    figures ending in _rmse must be at most their target; all others must be at least their target."""
+    """Name of an evaluation result -> target of this result. Training ends when all targets are reached. `falls` and results
+    whose names end in _rmse must be at most their targets; all other results must be at least their targets."""
     loop: Literal["stock", "captured"] = "captured"
-    """Training loop. `stock`: rsl-rl's own loop. `captured`: the same arithmetic, on a GPU as CUDA graphs. If the networks or
-    the algorithm cannot be captured, a message says so, and `stock` runs."""
+    """Training loop. `stock`: rsl-rl's own loop. `captured`: the same arithmetic in a loop that runs as CUDA graphs on a GPU.
+    If `captured` does not support the networks or the algorithm, a message says so, and `stock` runs."""
     matmul: Literal["float32", "tf32"] = "tf32"
     """Precision of matrix products during training. On a GPU `tf32` is faster, but keeps only 10 of the 23 mantissa bits of
-    the factors. On a CPU it keeps all bits and selects the fastest library."""
+    the factors. On a CPU `tf32` keeps all bits, and allows a faster library (oneDNN)."""
     experiment_name: str = field(default="", metadata=NAME)
     """Folder under logs/; the task's name when empty."""
     run_name: str = field(default="", metadata=NAME)
@@ -178,13 +178,13 @@ class RunnerConfig:
     report: bool = True
     """Write report.html and report.md into the run folder at the end of a training."""
     film: bool = True
-    """Record a film of the final policy for the report, which takes about ten seconds. There is no film if the training was
-    stopped early, or if the machine cannot render."""
+    """Record a film of the final policy for the report. The recording takes about ten seconds. There is no film if training
+    was stopped early, or if the machine cannot render."""
     logger: str = "tensorboard"
-    """Tracker in addition to TensorBoard: `wandb`, `neptune`, or module:Class of a writer that extends rsl-rl's LogWriter;
-    `tensorboard` for no other tracker."""
+    """Tracker that logs in addition to TensorBoard: `wandb`, `neptune`, or `module:Class`, a subclass of rsl-rl's LogWriter.
+    `tensorboard` means no additional tracker."""
     logger_project: str = field(default="", metadata=NAME)
-    """Project name for the tracker; the folder under logs/ when empty."""
+    """Name of the project in the tracker. If it is empty, the project has the name of the folder under logs/."""
 
 
 @dataclass(frozen=True)
@@ -198,4 +198,4 @@ class TrainConfig:
     distillation: DistillationConfig = DistillationConfig()
     """Settings of distillation."""
     runner: RunnerConfig = RunnerConfig()
-    """Length of training, checkpoints and names."""
+    """Settings of the training run: length, evaluations, checkpoints and names of folders."""

@@ -1,6 +1,6 @@
-"""Configuration of a legged robot that follows velocity commands. It extends the sections of every task.
+"""Configuration of a legged robot that follows velocity commands. Its sections extend those that all tasks have.
 
-Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same defaults.
+Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same defaults as there.
 """
 
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,7 @@ MOTION = between(-100, 100)
 """Bounds of velocities [m/s] or [rad/s], of angles [rad], and of factors on angles."""
 MEASURED = rescaled("m", items(500, between(-100, 100)))
 FASTEST = 20.0
-"""Largest command of an evaluation [m/s, rad/s]. The area that robots need grows with the square of the command."""
+"""Largest command of an evaluation [m/s, rad/s]. Reason: the area of the terrain grows with the square of the command."""
 Axis = tuple[float, float, float]
 """Lowest value, highest value, and step."""
 AXIS = between(-FASTEST, FASTEST)
@@ -52,19 +52,20 @@ class TerrainConfig:
     mesh_type: Literal["plane", "height_map"] = "plane"
     """Shape of the ground: an infinite horizontal plane, or a height map of num_rows x num_cols tiles."""
     curriculum: bool = True
-    """Move robots to harder rows while they succeed. Without it, every row has a random high difficulty, and robots stay in
-    their row."""
+    """Move robots to harder rows after success, and to easier rows after failure. Without a curriculum, robots stay in their
+    row, and each row has a random difficulty of 0.5, 0.75 or 0.9."""
     scale: float = field(default=1.0, metadata={**positive(100, low=0.01), "rescaled": "m"})
     """Factor on all lengths of the terrain types; 1 suits a robot that is half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; the shares sum to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
     sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes", positive(100)))
-    """Terrain type -> size of all its tiles, or range [low, high], in the type's unit. Sizes in a range change evenly from
-    the easier end in the first row to the harder end at difficulty 1. An entry replaces the type's default sizes."""
+    """Terrain type -> size of all its tiles, or range [low, high] of their sizes, in the type's unit. In a range the
+    size changes linearly, from the easier end at difficulty 0 to the harder end at difficulty 1. An entry replaces the type's
+    default sizes."""
     num_rows: int = field(default=10, metadata=between(1, 1000))
-    """Number of rows. The difficulty of a row is row / num_rows."""
+    """Number of rows. In a curriculum, row r = 0, 1, 2 ... has the difficulty r / num_rows."""
     num_cols: int = field(default=20, metadata=between(1, 1000))
-    """Number of columns, each of one type."""
+    """Number of columns. All tiles of a column have the same terrain type."""
     terrain_length: float = field(default=8.0, metadata=rescaled("m", positive(1000, low=0.01)))
     """Length of a tile along x [m]."""
     terrain_width: float = field(default=8.0, metadata=rescaled("m", positive(1000, low=0.01)))
@@ -74,46 +75,46 @@ class TerrainConfig:
     horizontal_scale: float = field(default=0.1, metadata=rescaled("m", positive(10, low=1e-3)))
     """Edge length of a cell of the height map [m]."""
     slope_threshold: float = field(default=0.2, metadata=between(0, 1000))
-    """Slope (rise over run) above which two neighbouring cells get a vertical face between them, in types made of steps."""
+    """In terrain types with steps: slope (rise over run) above which a vertical face separates two neighbouring cells."""
     max_init_terrain_level: int = field(default=5, metadata=between(0, 999))
     """Highest row in which robots start the training."""
     spawn_range: float = field(default=1.0, metadata=rescaled("m", between(0, 1000)))
     """Largest distance of a robot's start from the middle of its tile, in x and in y [m]."""
     measured_points_x: tuple[float, ...] = field(default=tuple(round(0.1 * i - 0.8, 1) for i in range(17)), metadata=MEASURED)
-    """Positions of the measured heights, forward of the base [m]."""
+    """Forward (x) coordinates of the points at which the ground's height is measured, in the base's yaw frame [m]."""
     measured_points_y: tuple[float, ...] = field(default=tuple(round(0.1 * i - 0.5, 1) for i in range(11)), metadata=MEASURED)
-    """Positions of the measured heights, to the left of the base [m]."""
+    """Leftward (y) coordinates of the points at which the ground's height is measured, in the base's yaw frame [m]."""
     scan: Literal["lowest", "own", "highest"] = "lowest"
-    """Value that a measured point reads from the height map: the `lowest` of its cell and the next cells in x and y, as in
-    legged_gym; the height of its `own` cell; or the `highest` of these three."""
+    """Height that a measured point reads from the height map. `own`: the height of the point's cell. `lowest` (as in
+    legged_gym) or `highest`: the lowest or highest of three heights, of this cell and of the next cells along +x and +y."""
 
 
 @dataclass(frozen=True)
 class CommandRanges:
-    """Largest ranges of commands. A curriculum starts from a share of them."""
+    """Full ranges of the commands. A curriculum starts from a share of these ranges."""
 
     lin_vel_x: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Forward velocity in the base frame [m/s]."""
     lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Leftward velocity in the base frame [m/s]."""
     ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=quantity("rad/s", MOTION))
-    """Yaw rate [rad/s]. In heading mode this range limits the heading controller; a curriculum widens the range too."""
+    """Yaw rate [rad/s]. In heading mode, the yaw rate that the heading controller commands is clipped to this range."""
     heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=quantity("rad", MOTION))
-    """Heading in the world, in heading mode only [rad]."""
+    """Heading in the world frame [rad]. It is used only in heading mode."""
 
 
 @dataclass(frozen=True)
 class CommandCurriculumConfig:
-    """Curriculum that widens the range of each command axis while robots follow that axis well."""
+    """Curriculum that widens the range of each command axis while robots follow the commands on that axis well."""
 
     enabled: bool = False
-    """Start from the share `start` of the full ranges and widen them; otherwise use the full ranges from the first step."""
+    """Start with the share `start` of the full ranges and widen the ranges; otherwise use the full ranges from the start."""
     start: float = field(default=0.3, metadata=UNIT)
     """Initial share of the full range on each axis."""
     step: float = field(default=0.1, metadata=positive(1, low=1e-6))
-    """Share of the full range by which an axis is widened each time."""
+    """Share of the full range that each widening adds to the range of an axis."""
     window_s: float = field(default=1.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Time over which velocities are averaged to decide about an axis [s]."""
+    """Time over which velocities are averaged before the curriculum decides whether to widen a range [s]."""
     threshold: float = field(default=0.75, metadata=UNIT)
     """Share of the commanded velocity that robots must reach on average before an axis is widened."""
 
@@ -133,14 +134,14 @@ class CommandsConfig:
     standing_share: float = field(default=0.0, metadata=UNIT)
     """Share of the sampled commands that are zero, so that the robot stands still."""
     single_axis_share: float = field(default=0.0, metadata=UNIT)
-    """Share of sampled commands on a single random axis: walking straight, sideways, or turning on the spot."""
+    """Share of the moving commands that use a single random axis: walking straight, walking sideways, or turning in place."""
     curriculum: CommandCurriculumConfig = CommandCurriculumConfig()
     """Curriculum that widens the ranges during training."""
 
 
 @dataclass(frozen=True)
 class InitStateConfig:
-    """State after a reset. The default joint angles and the spawn height are those of the robot."""
+    """State after a reset. The robot's files set the default joint angles and the spawn height."""
 
     dof_pos_factor: Range = field(default=(0.5, 1.5), metadata=MOTION)
     """Range of a random factor on each default joint angle."""
@@ -156,7 +157,7 @@ class LeggedControlConfig(ControlConfig):
 
     control_type: Law | dict[str, Law] = "P"
     """Meaning of an action: joint position target (P), joint velocity target (V), or torque (T). One law, or joint-name
-    pattern -> law. The actions of wheels are velocities or torques."""
+    pattern -> law. Wheels need V or T, unless they are `held`."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=quantity("N m/rad", between(0, LARGEST)))
     """Joint-name pattern -> P gain [N m/rad]; empty for the robot's gains. A pattern is a part of the joint's name."""
     damping: dict[str, float] = field(default_factory=dict, metadata=quantity("N m s/rad", between(0, LARGEST)))
@@ -165,9 +166,9 @@ class LeggedControlConfig(ControlConfig):
     """Scale of the actions: one number, or joint-name pattern -> number. Law P: target = action_scale * action + default
     angle [rad]. Laws V and T: target = action_scale * action [rad/s] or [N m]."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Patterns of joints that have no action. They need law P, which holds them at the default angle with their own gains."""
+    """Name patterns of joints without an action. These joints need law P: their gains hold them at their default angles."""
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
-    """Properties of motors that are not ideal: torque limits over speed, friction, delay, learned actuators."""
+    """Properties of real motors: torque limits that depend on speed, friction, delay, learned actuator models."""
 
     @property
     def laws(self) -> set[str]:
@@ -180,8 +181,9 @@ class LeggedTerminationsConfig(TerminationsConfig):
     """Terms that end an episode."""
 
     failures: tuple[str, ...] = field(default=("contact", "base_height", "tilt"), metadata=TERMS)
-    """Terms that count as failures. `contact`: the contact force on a `terminate_after_contacts_on` shape exceeds 1 N, or for
-    robots lighter than 100 N, 1 % of the weight. `base_height` and `tilt`: limits min_base_height and max_tilt."""
+    """Terms that count as failures. `contact`: a shape of the robot's `terminate_after_contacts_on` has a contact force
+    above 1 N (or 1 % of the robot's weight, if smaller). `base_height`, `tilt`: the base is below min_base_height, or
+    tilted by more than max_tilt."""
     time_outs: tuple[str, ...] = field(default=("left_terrain",), metadata=TERMS)
     """Terms that count as time-outs. `left_terrain`: the robot left the map, which does not count as a failure."""
     min_base_height: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
@@ -197,8 +199,8 @@ class LeggedDomainRandConfig(DomainRandConfig):
     randomize_friction: bool = True
     """Randomise the friction of each robot's contacts."""
     friction_range: Range = field(default=(0.5, 1.25), metadata=between(0, 100))
-    """Range of the feet's Coulomb friction. In MuJoCo it is also that of the contacts, because a foot has priority over the
-    ground. PhysX takes the average of foot and ground."""
+    """Range of the Coulomb friction of the robot's shapes. In MuJoCo a contact with the ground has the robot's
+    friction, because the robot's shapes have priority. In PhysX a contact has the mean friction of robot and ground."""
     friction_buckets: int = field(default=64, metadata=between(1, 1_000_000))
     """Number of different friction values."""
     randomize_base_mass: bool = False
@@ -210,19 +212,19 @@ class LeggedDomainRandConfig(DomainRandConfig):
     push_interval_s: float = field(default=15.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time between two pushes of a robot [s]."""
     max_push_vel_xy: float = field(default=1.0, metadata=rescaled("m/s", between(0, 100)))
-    """Largest velocity of a push, per world axis [m/s]."""
+    """Largest velocity that a push gives to the base along the x and y axes of the world [m/s]."""
     kicks: dict[str, KickConfig] = field(default_factory=dict)
     """Any name -> sudden changes of the base's velocity. A kick adds to the velocity that push_robots has set."""
     forces: dict[str, ForceConfig] = field(default_factory=dict)
     """Any name -> a temporary force on a body of the robot."""
 
     observed_forces: dict[str, ForceConfig] = field(default_factory=dict)
-    """Any name -> a force that is observed (`_obs_push_force`) but does not act. Play and evaluation put the forces of the
-    training here."""
+    """Any name -> a force that is observed (`_obs_push_force`) but does not act. Play and evaluation move
+    `forces` here, so that the observation keeps its size and scale."""
 
     def nominal(self) -> Self:
         plain = super().nominal()
-        by_flag: dict[str, Range | DrawConfig] = {}  # these two have flags, which play and evaluation clear
+        by_flag: dict[str, Range | DrawConfig] = {}  # both ranges have flags, which play and evaluation set to false
         if self.randomize_friction:
             by_flag["friction"] = self.friction_range
         if self.randomize_base_mass:
@@ -234,7 +236,7 @@ class LeggedDomainRandConfig(DomainRandConfig):
 
 @dataclass(frozen=True)
 class LeggedRewardsConfig(RewardsConfig):
-    """Scales of the `_reward_<name>` terms, and their parameters."""
+    """Scales and parameters of the `_reward_<name>` terms."""
 
     scales: dict[str, float] = field(
         default_factory=lambda: {
@@ -252,9 +254,9 @@ class LeggedRewardsConfig(RewardsConfig):
     )
     """Term -> scale, which is multiplied by the control step. A scale of 0 switches the term off."""
     only_positive_rewards: bool = True
-    """Clip the sum of rewards (except `termination`) at zero, so that the policy does not learn early to fall."""
+    """Clip the sum of rewards (except `termination`) at zero. Otherwise a new policy may learn to end episodes by falls."""
     tracking_sigma: float = field(default=0.25, metadata=positive(LARGEST, low=1e-6))
-    """Width of the tracking rewards exp(-error^2 / sigma)."""
+    """Width `sigma` of the tracking rewards exp(-error^2 / sigma)."""
     air_time_target_s: float = field(default=0.5, metadata=rescaled("s", between(0, 100)))
     """Target of the swing time [s]. feet_air_time rewards longer swings and punishes shorter ones; single_stance is largest
     at this time."""
@@ -263,13 +265,13 @@ class LeggedRewardsConfig(RewardsConfig):
     base_height_target: float = field(default=0.5, metadata=rescaled("m", positive(100)))
     """Target of base_height: height of the base above the ground [m]."""
     max_contact_force: float = field(default=500.0, metadata=rescaled("N", positive(LARGEST)))
-    """Foot force above which feet_contact_forces punishes [N]."""
+    """Limit of the contact force of a foot [N]. The term feet_contact_forces punishes larger forces."""
     soft_dof_pos_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's range outside which dof_pos_limits punishes."""
+    """Allowed share of a joint's range, about the middle of the range. The term dof_pos_limits punishes angles outside."""
     soft_dof_vel_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's velocity limit above which dof_vel_limits punishes."""
+    """Allowed share of a joint's velocity limit. The term dof_vel_limits punishes higher speeds."""
     soft_torque_limit: float = field(default=1.0, metadata=positive(10))
-    """Share of a joint's effort limit above which torque_limits punishes."""
+    """Allowed share of a joint's effort limit. The term torque_limits punishes larger torques."""
 
 
 STATE_TERMS = ("base_lin_vel", "base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions")
@@ -290,7 +292,7 @@ class LeggedObservationsConfig(ObservationsConfig):
         default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0},
         metadata=rescaled_by_term("_obs_", -1, between(-LARGEST, LARGEST)),
     )
-    """Term -> factor; 1 for other terms. By default `commands` have the factors of the velocities."""
+    """Term -> factor; 1 without an entry. Without an entry, `commands` have the factors of base_lin_vel and base_ang_vel."""
     noise: dict[str, float] = field(
         default_factory=lambda: {
             "base_lin_vel": 0.1,
@@ -304,15 +306,15 @@ class LeggedObservationsConfig(ObservationsConfig):
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     heights_offset: float = field(default=0.5, metadata=rescaled("m", between(-100, 100)))
-    """Distance below the base from which observed heights are measured [m]."""
+    """Distance of the ground below the base at which the observed height is 0 [m]."""
     heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))
     """Largest absolute value of an observed height [m]."""
     depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
-    """Largest observed depth of low ground [m]. It has an effect only below heights_limit; 0 switches it off."""
+    """Largest observed depth of low ground [m]. A value above heights_limit has no effect; 0 switches this limit off."""
     once_trained: HeightLimitsConfig = field(default_factory=HeightLimitsConfig)
-    """Limits of observed heights in play, evaluation and export, where they differ from those of the training."""
+    """Limits of observed heights that replace the training's limits in play, evaluation and export."""
     height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
-    """Errors of the height map, in addition to the noise of its points."""
+    """Errors of the observed height map, in addition to the noise of single points."""
 
     @property
     def deepest(self) -> float:
@@ -335,8 +337,8 @@ class EvaluationConfig:
     yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("rad/s", AXIS))
     """Yaw rates of the command grid: lowest, highest, step [rad/s]."""
     stairs: float = field(default=0.36, metadata=positive(10))
-    """Height of the stairs in a table of several tasks, as a share of rewards.base_height_target. The table shows the success
-    rate at the next larger measured height."""
+    """Height of the stairs' steps in a table of many trainings, as a share of rewards.base_height_target. The table shows the
+    success rate at this height, or at the next larger height that was measured."""
 
 
 @dataclass(frozen=True)
@@ -344,7 +346,7 @@ class LeggedConfig(TaskConfig):
     """Configuration of a legged robot that follows velocity commands."""
 
     robot: str = ""
-    """Robot: a folder under resources/robots/, or the path of a folder, relative to the configuration file."""
+    """Robot: the name of a folder under resources/robots/, or the path of a folder relative to the configuration file."""
     terrain: TerrainConfig = field(default_factory=TerrainConfig)
     """Terrain under the robots."""
     commands: CommandsConfig = field(default_factory=CommandsConfig)

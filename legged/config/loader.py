@@ -1,4 +1,4 @@
-"""Loading of a TaskConfig from YAML files and `key=value` overrides. Every error names the file and the dotted path."""
+"""Loading of a TaskConfig from YAML files and `key=value` overrides. Errors name the file and the setting's dotted path."""
 
 import copy
 import dataclasses
@@ -28,17 +28,18 @@ class Registered:
 
     config: Path | Mapping[str, Any]
     folder: Path
-    """Folder of that code. Paths in a mapping are relative to it."""
+    """Folder of the user-defined code. Paths in a mapping are relative to this folder."""
 
 
 Source = Path | Mapping[str, Any] | Registered
 Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
-"""Function: (settings, the robot for which they were written, the task's robot, beginning of errors) -> settings for the
+"""Function: (settings, the robot for which they were written, the task's robot, prefix of error messages) -> settings for the
 task's robot."""
 
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
-    """Merge `top` into `base` in place: maps merge, lists and scalars replace. Record the source of each path in `origins`.
+    """Merge `top` into `base` in place. Maps are merged key by key. A list or a scalar replaces the value in `base`. Record
+    `source` in `origins` as the source of each path.
 
     Raises:
         ConfigError: the maps are nested too deeply.
@@ -64,13 +65,13 @@ class _Layer:
     data: Mapping[str, Any]
     """Settings, without `extends`, `class` and `written_for`."""
     name: str
-    """Name in errors."""
+    """Name of the configuration in error messages."""
     folder: Path
     """Folder to which the paths in the settings are relative."""
     task: str | None
     """Name of the registered task; None for a file."""
     kind: Any
-    """Value of `class:`, or None."""
+    """Value of the key `class`; None without this key."""
     reference_robot: Any
     """Robot for which the numbers were written; None if they suit any robot."""
 
@@ -79,7 +80,7 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
     """Return the configuration of `task` and the chain of configurations that it extends.
 
     Raises:
-        ConfigError: one of them is missing, can't be read, or extends itself.
+        ConfigError: a configuration is missing, can't be read, or extends itself.
     """
     layers: list[_Layer] = []
     seen: list[Any] = []
@@ -90,7 +91,7 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
             chain = " -> ".join(Path(n).name for n in (*(layer.name for layer in layers), name))
             raise ConfigError(f"{name}: extends itself: {chain}")
         if len(layers) == LONGEST_CHAIN:
-            raise ConfigError(f"{name}: extends: more than {LONGEST_CHAIN} files extend each other")
+            raise ConfigError(f"{name}: extends: the chain of `extends` has more than {LONGEST_CHAIN} files")
         seen.append(_mark(found))
         data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
         if isinstance(data.get("cpu"), Mapping):
@@ -115,11 +116,11 @@ def _mark(source: Source) -> Any:
 def _parent(
     parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
 ) -> tuple[Path | Registered, str]:
-    """Return the configuration that `extends: parent` names, and its name. The configuration is that of a file in the
-    folder `beside`, else of a registered task, else of a task of this package.
+    """Find the configuration `parent`, which the configuration `name` extends. Return it and its name. The search covers
+    the files in the folder `beside`, then the registered tasks, then the tasks of this package.
     """
     if not isinstance(parent, str) or not parent:
-        raise ConfigError(f"{name}: extends: expected the name of a task or of a file next to this one, got {shown(parent)}")
+        raise ConfigError(f"{name}: extends: expected the name of a task or a file in the same folder, got {shown(parent)}")
     file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
     if beside is not None and exists(beside / file):
         return beside / file, parent
@@ -129,7 +130,7 @@ def _parent(
         return data_folder("cfg") / file, parent
     folders = [data_folder("cfg"), *([] if beside is None else [beside])]
     names = {path.stem for folder in folders for path in folder.glob("*.yaml")} | set(registered)
-    raise ConfigError(f"{name}: extends: there is no {shown(parent)}{suggest(parent[:SHOWN], names)}")
+    raise ConfigError(f"{name}: extends: there is no task or file {shown(parent)}{suggest(parent[:SHOWN], names)}")
 
 
 @dataclass(frozen=True)
@@ -137,11 +138,11 @@ class ClassHint:
     """Class of the task according to one configuration in a chain of `extends`."""
 
     where: str
-    """Beginning of errors about this hint."""
+    """Prefix of error messages about this hint."""
     task: str | None
-    """Name of the registered task, which may have been registered with a class; None for a file."""
+    """Name of the registered task; None for a file. The registration may name a class too."""
     kind: Any
-    """Value of `class:`, or None."""
+    """Value of the key `class`; None without this key."""
 
 
 def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
@@ -152,11 +153,11 @@ def class_hints(source: Source, task: str, registered: Mapping[str, Registered])
 def _merged(
     layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
-    """Merge layers. The values of a configuration replace those of the configurations that it extends. With `on_cpu`, the
-    `cpu:` section of each layer is merged on top of the layer.
+    """Merge layers. The values of a layer replace those of the layers that it extends. With `on_cpu`, the `cpu:` section of
+    each layer is merged on top of the layer.
 
-    Each layer is checked separately, so that a later layer can't hide a mistake. Numbers of a layer with a reference robot
-    are rescaled for `robot`, or if `robot` is None, for the robot that the layers name.
+    Each layer is checked before the merge, because the values of another layer could hide its mistakes. Numbers of a layer
+    with a reference robot are rescaled for `robot`. If `robot` is None, they are rescaled for the robot that the layers name.
 
     Raises:
         ConfigError: a layer does not fit the schema.
@@ -197,7 +198,7 @@ def _merged(
 
 
 def name_of(source: Source, task: str) -> str:
-    """Return the name of a task's configuration in errors."""
+    """Return the name of a task's configuration for error messages."""
     given = source.config if isinstance(source, Registered) else source
     return str(given) if isinstance(given, Path) else f"registered config of '{task}'"
 
@@ -224,9 +225,10 @@ def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
-    """Return the setting `robot` of a file in `folder`. A path becomes absolute. The setting is a path if it has a slash or a
-    leading dot, or names a folder next to the file or in the working directory. Names of robots under resources/robots/ are
-    returned unchanged.
+    """Return `robot`, a setting of a configuration file in `folder`, with a path made absolute.
+
+    Names of robots under resources/robots/ are returned unchanged. Any other value is a path if it has a slash or a leading
+    dot, or if it names a robot's folder in `folder` or in the working directory.
     """
     if not isinstance(robot, str) or not robot or exists(data_folder("resources") / "robots" / robot / "robot.yaml"):
         return robot
@@ -238,7 +240,7 @@ def robot_path(robot: Any, folder: Path) -> Any:
 
 def actuator_path(section: Any, folder: Path) -> None:
     """Make the path of a learned actuator in `section` absolute. The path is relative to `folder`, the folder of the
-    configuration file, or else to the working directory.
+    configuration file. If no such file exists there, the path is relative to the working directory.
     """
     for key in ("control", "actuator"):
         section = section.get(key) if isinstance(section, Mapping) else None
@@ -251,7 +253,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     """Return `a.b=1e-3` as ("a.b", 0.001). The value is read as YAML.
 
     Raises:
-        ConfigError: the text has another form.
+        ConfigError: the text does not have the form section.key=value.
     """
     key, equals, value = text.partition("=")
     if not equals or not key:
@@ -278,11 +280,11 @@ def load_config(
     """Load the configuration of a task as an instance of `schema`.
 
     The file or mapping `source` is merged onto the configurations that it extends, which are files or tasks in `registered`.
-    With `on_cpu` their `cpu:` sections are merged too. Overrides come last. `rescale` converts numbers that were written for
-    another robot, but no overrides.
+    With `on_cpu`, the `cpu:` section of each configuration is merged too. `overrides` are merged last. `rescale` converts
+    numbers that were written for another robot. It does not change overrides.
 
     Raises:
-        ConfigError: an unknown key, a wrong type or a wrong value; the text names file and dotted path.
+        ConfigError: an unknown key, a wrong type or a wrong value. The message names the file and the setting's dotted path.
     """
     name = name_of(source, task)
     overrides = list(overrides)
@@ -298,8 +300,8 @@ def load_config(
 def _merge_overrides(
     data: dict[str, Any], overrides: Iterable[tuple[str, Any]], origins: Origins, schema: type[TaskConfig]
 ) -> None:
-    """Merge overrides of the command line into `data`. Each override is checked separately, so that a later one can't hide a
-    mistake.
+    """Merge overrides of the command line into `data`. Each override is checked before the merge, because a later override
+    could hide its mistake.
     """
     for key, value in overrides:
         if key == "task":
@@ -319,8 +321,8 @@ def from_dict(
     source: str = "config",
     schema: type[TaskConfig] = LeggedConfig,
 ) -> TaskConfig:
-    """Build an instance of `schema` from nested plain values. `origins` gives the sources of the values if not all are from
-    `source`.
+    """Build an instance of `schema` from nested plain values. `origins` holds the sources of the values. Without
+    `origins`, all values are from `source`.
     """
     if origins is None:
         data = renamed(data, source)

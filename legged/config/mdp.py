@@ -13,7 +13,7 @@ class ControlConfig:
     """Conversion of actions to controls of the robot."""
 
     decimation: int = field(default=4, metadata=between(1, 1000))
-    """Physics steps per control step. The control law is computed in each of them."""
+    """Number of physics steps per control step. The control law is computed in every physics step."""
     clip_actions: float = field(default=100.0, metadata=positive(LARGEST))
     """Absolute value at which actions are clipped."""
 
@@ -23,7 +23,7 @@ class TerminationsConfig:
     """Terms `_terminate_<name>` that end an episode. NaN, infinite numbers and the time limit also end it."""
 
     failures: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Terms that end an episode as a failure. The learner expects no reward after it."""
+    """Terms that end an episode as a failure. The learner assumes that no reward follows a failure."""
     time_outs: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Terms that end an episode as a time-out. The learner bootstraps the value of the last state."""
 
@@ -35,16 +35,17 @@ class DomainRandConfig:
     ranges: dict[str, Range | DrawConfig] = field(
         default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> range of a uniform distribution, from which each robot's value is sampled at the start; or a mapping with
-    `range`, `distribution`, `when` and more (DrawConfig). Properties: legged/physics/fields.py."""
+    """Property -> range of a uniform distribution, from which each robot's value is sampled once before training. For another
+    distribution or time, the entry is a mapping with `range`, `distribution`, `when` and more (DrawConfig). The properties
+    are listed in legged/physics/fields.py."""
     observed_ranges: dict[str, Range | DrawConfig] = field(
         default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
     )
-    """Property -> range that scales the observation `_obs_rand_<property>`; by default that in `ranges`. Play and evaluation
-    put the ranges of the training here."""
+    """Property -> range that the observation `_obs_rand_<property>` scales to [-1, 1]. By default, this is the
+    property's range in `ranges`. Play and evaluation copy the ranges of the training to this setting."""
 
     def nominal(self) -> Self:
-        """Return a copy without randomisation, for play and evaluation. Observations keep their scales."""
+        """Return a copy without randomisation, for play and evaluation. The ranges move to `observed_ranges`."""
         return replace(self, ranges={}, observed_ranges={**self.observed_ranges, **self.ranges})
 
 
@@ -55,9 +56,9 @@ class RewardsConfig:
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
     """Term -> scale. A scale of 0 switches the term off."""
     times_dt: bool = True
-    """Multiply scales by the control step, so that sums over time do not depend on it."""
+    """Multiply scales by the control step, so that sums of rewards over time do not depend on the control step."""
     only_positive_rewards: bool = False
-    """Clip the sum of rewards (except `termination`) at zero, so that the policy does not learn early to fall."""
+    """Clip the sum of rewards (except `termination`) at zero, so that a robot can't avoid negative rewards by falling."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class ObservationGroupConfig:
     terms: tuple[str, ...] = field(default=(), metadata=NAMES)
     """Names of `_obs_<name>` terms, concatenated in this order."""
     history: int = field(default=1, metadata=between(1, 1000))
-    """Number of steps that are concatenated, oldest first. A new episode repeats its first step."""
+    """Number of concatenated control steps, oldest first. The first step of an episode fills the whole history."""
     noise: bool = False
     """Add uniform noise to the terms."""
 
@@ -77,19 +78,20 @@ class ObservationsConfig:
     """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)
-    """Group -> terms, history and noise of the group. `train.policy` sets the groups that each network reads; by default the
+    """Name of a group -> its terms, history and noise. `train.policy` sets the groups that each network reads. By default the
     policy reads the group `actor`."""
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
-    """Term -> factor; 1 for other terms."""
+    """Term -> factor on its values. A term without an entry has the factor 1."""
     add_noise: bool = True
     """Add noise to the groups with `noise: true`."""
     noise_level: float = field(default=1.0, metadata=between(0, 1000))
-    """Factor on all noise."""
+    """Factor on the noise of all terms."""
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)))
-    """Term -> half width of a constant error in each of the term's numbers, sampled for each episode, in the term's unit
-    before scaling. Bias, delay and lost packets affect only groups with noise, and only while `add_noise` is on."""
+    """Term -> half width of its uniform bias, in the term's unit before scaling. Each number of the term has its own bias,
+    which is sampled for each episode. Bias, delay and lost packets affect only groups with `noise: true`, and only if
+    `add_noise` is true."""
     delay: dict[str, Steps] = field(default_factory=dict, metadata=between(0, LONGEST_DELAY))
     """Term -> range of its delay, in control steps. Each robot's delay is sampled for each episode."""
     dropped: dict[str, float] = field(default_factory=dict, metadata=UNIT)
@@ -98,5 +100,5 @@ class ObservationsConfig:
     """Absolute value at which scaled observations are clipped."""
 
     def trained(self) -> Self:
-        """Return the settings of a trained policy's observations for play, evaluation and export."""
+        """Return the settings of the observations for play, evaluation and export of a trained policy."""
         return self

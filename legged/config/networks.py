@@ -34,8 +34,8 @@ def check_networks(cfg: TaskConfig) -> None:
     """Check that the networks fit the observations, each other and the learner.
 
     Raises:
-        ConfigError: a network reads an unknown group; the initial standard deviation is out of bounds; a mirror loss lacks
-            symmetry; or a recurrent policy, an estimator or a student has settings that it can't learn with.
+        ConfigError: a network reads an unknown group; the initial standard deviation is out of bounds; a mirror loss is set
+            without `symmetry`; or a setting does not work with a recurrent policy, an estimator or a student.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     known = cfg.observations.groups
@@ -67,8 +67,8 @@ def _check_estimator(cfg: TaskConfig) -> None:
     """Check an estimator against the other settings.
 
     Raises:
-        ConfigError: the estimator has outputs but no targets, the name of its group is taken, or a setting needs rsl-rl's own
-            update, which cannot train an estimator.
+        ConfigError: the estimator has latent outputs but no targets; an observation group has the name that is reserved for
+            the targets; or a setting needs rsl-rl's own update, which cannot train an estimator.
     """
     policy, algorithm, origins = cfg.train.policy, cfg.train.algorithm, cfg.origins
     path = "train.policy.estimator.targets"
@@ -79,7 +79,7 @@ def _check_estimator(cfg: TaskConfig) -> None:
         return
     if ESTIMATED in cfg.observations.groups:
         where = origins.where(f"observations.groups.{ESTIMATED}")
-        raise ConfigError(f"{where}: '{ESTIMATED}' is the group of the estimator's targets ({path}); rename yours")
+        raise ConfigError(f"{where}: '{ESTIMATED}' is the group of the estimator's targets ({path}); rename your group")
     for field, value, wanted in (
         ("train.policy.rnn_type", policy.rnn_type, "none"),
         ("train.policy.state_dependent_std", policy.state_dependent_std, False),
@@ -98,22 +98,22 @@ def _check_student(cfg: TaskConfig) -> None:
     """Check a student against the settings of distillation.
 
     Raises:
-        ConfigError: the student has a learned standard deviation or an estimator, or gradient_length does not divide the
-            steps of an iteration.
+        ConfigError: the student has a learned standard deviation or an estimator, or `gradient_length` does not divide the
+            number of steps of an iteration.
     """
     policy, origins = cfg.train.policy, cfg.origins
     if policy.state_dependent_std:
         where = origins.where("train.policy.state_dependent_std")
-        raise ConfigError(f"{where}: must be false, because a student learns the mean of the actions alone")
+        raise ConfigError(f"{where}: must be false, because a student learns only the mean of the actions")
     if policy.estimator.targets:
         where = origins.where("train.policy.estimator.targets")
-        raise ConfigError(f"{where}: must be [], because a student learns no estimator")
+        raise ConfigError(f"{where}: must be [], because a student can't train an estimator")
     length, steps = cfg.train.distillation.gradient_length, cfg.train.runner.num_steps_per_env
     if steps % length:
         where = origins.where("train.distillation.gradient_length")
         given = f"train.runner.num_steps_per_env={steps} ({origins.of('train.runner.num_steps_per_env')})"
         nearest = min((n for n in range(1, steps + 1) if steps % n == 0), key=lambda n: abs(n - length))
-        raise ConfigError(f"{where}: must divide {given}, got {length} (nearest: {nearest})")
+        raise ConfigError(f"{where}: must divide {given}, got {length} (nearest divisor: {nearest})")
 
 
 def _check_recurrent(cfg: TaskConfig) -> None:
@@ -130,5 +130,6 @@ def _check_recurrent(cfg: TaskConfig) -> None:
     if algorithm.num_mini_batches > cfg.env.num_envs:
         where, given = origins.where("train.algorithm.num_mini_batches"), algorithm.num_mini_batches
         raise ConfigError(
-            f"{where}: {recurrent} splits mini-batches by robot: must be at most env.num_envs={cfg.env.num_envs}, got {given}"
+            f"{where}: must be at most env.num_envs={cfg.env.num_envs}, because {recurrent} splits mini-batches by robot;"
+            f" got {given}"
         )

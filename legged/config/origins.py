@@ -31,5 +31,5 @@ class Origins(dict[str, str]):
         return ", ".join(dict.fromkeys(found)) or "the default"
 
     def where(self, path: str) -> str:
-        """Return the beginning of an error about `path`: 'cfg/mine.yaml: terrain.border_size'."""
+        """Return the prefix of an error message about `path`, such as 'cfg/mine.yaml: terrain.border_size'."""
         return f"{self.of(path)}: {path}"

@@ -17,10 +17,10 @@ class DrawConfig:
     range: Range = field(default=(0.0, 0.0), metadata=between(-LARGEST, LARGEST))
     """Lowest and highest value, in the unit of the property."""
     distribution: Literal["uniform", "log_uniform", "gaussian"] = "uniform"
-    """Distribution over the range: `uniform`; `log_uniform`, uniform in the logarithm; or `gaussian` around the middle, cut
-    off at the ends."""
+    """Distribution over the range. `log_uniform` is uniform in the logarithm of the value. `gaussian` has its mean in the
+    middle of the range and is cut off at the ends."""
     std: float = field(default=0.0, metadata=between(0, LARGEST))
-    """Standard deviation of `gaussian` before it is cut off, in the unit of the property; 0 for a quarter of the range's
+    """Standard deviation of `gaussian` before it is cut off, in the unit of the property. 0 means a quarter of the range's
     width."""
     when: Literal["start", "reset", "interval"] = "start"
     """Time at which a robot's value is sampled: once before training (`start`), at the beginning of each episode (`reset`),
@@ -31,8 +31,8 @@ class DrawConfig:
     """True: sample a value for each part that has the property (joint, body, shape). False: sample one value for the whole
     robot. Null: the property's default."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """First and last training iteration in which the range widens; [0, 0] for the full range at once. It widens from the
-    property's neutral value or, if the range excludes this value, from the nearer end of the range."""
+    """First and last training iteration in which the range widens. [0, 0] means the full range from the start. The range
+    widens from the property's neutral value. If this value is outside the range, it widens from the nearer end."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class KickConfig:
     x: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
     """Range of the change of the base's velocity along x, world frame [m/s]."""
     y: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
-    """Range of the change along y, world frame [m/s]."""
+    """Range of the change of the base's velocity along y, world frame [m/s]."""
     z: Range = field(default=(0.0, 0.0), metadata=rescaled("m/s", KICK))
-    """Range of the change along z, world frame [m/s]."""
+    """Range of the change of the base's velocity along z, world frame [m/s]."""
     roll: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
     """Range of the change of the base's angular velocity about the base's x axis, base frame [rad/s]."""
     pitch: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
-    """Range of the change about the base's y axis, base frame [rad/s]."""
+    """Range of the change of the base's angular velocity about the base's y axis, base frame [rad/s]."""
     yaw: Range = field(default=(0.0, 0.0), metadata=rescaled("rad/s", KICK))
-    """Range of the change about the base's z axis, base frame [rad/s]."""
+    """Range of the change of the base's angular velocity about the base's z axis, base frame [rad/s]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """First and last iteration in which the ranges widen from zero; [0, 0] for the full ranges at once."""
+    """First and last training iteration in which the ranges widen from zero. [0, 0] means the full ranges from the start."""
 
 
 @dataclass(frozen=True)
@@ -62,19 +62,19 @@ class ForceConfig:
     """Temporary force on a body of the robot, at random intervals."""
 
     body: str = ""
-    """Body of the robot's model; empty for the base."""
+    """Name of a body in the robot's model; empty for the base."""
     interval_s: Range = field(default=(5.0, 10.0), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Range of the time from the end of a push to the robot's next push, sampled for each push [s]."""
     duration_s: Range = field(default=(0.1, 0.5), metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
-    """Range of a push's duration [s]. It is rounded to whole control steps, at least one."""
+    """Range of a push's duration [s]. A duration is rounded to whole control steps, at least one."""
     x: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
     """Range of the force along x at the body's centre of mass, world frame [N]."""
     y: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
-    """Range of the force along y, world frame [N]."""
+    """Range of the force along y at the body's centre of mass, world frame [N]."""
     z: Range = field(default=(0.0, 0.0), metadata=rescaled("N", between(-LARGEST, LARGEST)))
-    """Range of the force along z, world frame [N]."""
+    """Range of the force along z at the body's centre of mass, world frame [N]."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
-    """First and last iteration in which the ranges widen from zero; [0, 0] for the full ranges at once."""
+    """First and last training iteration in which the ranges widen from zero. [0, 0] means the full ranges from the start."""
 
 
 def draw_of(entry: Range | DrawConfig) -> DrawConfig:

@@ -1,4 +1,4 @@
-"""Descriptions of the schema's fields for the reference and for completion: path, type, default, unit, bounds and meaning."""
+"""Path, type, default, unit, bounds and meaning of each field of a schema, for the reference pages and shell completion."""
 
 import ast
 import dataclasses
@@ -25,9 +25,9 @@ class FieldText:
     kind: str
     """Accepted values, such as "a number" or "one of P, V, T"."""
     default: Any
-    """Default as plain values; None for a section, because its fields have defaults."""
+    """Default as plain values; None for a section, because each of its fields has a default."""
     unit: str
-    """Unit in the metadata (`quantity` and `rescaled` in bounds.py); empty for maps with several units."""
+    """Unit that `quantity` or `rescaled` (bounds.py) declares; empty without such a unit."""
     bounds: str
     """Bounds of the field's numbers, in words; empty if they have no bounds."""
     meaning: str
@@ -35,11 +35,11 @@ class FieldText:
     choices: tuple[str, ...] = ()
     """All values that the field can have; empty if they cannot be listed."""
     is_section: bool = False
-    """True if the field is a section. The section's own fields follow."""
+    """True if the field is a section. `fields` yields the section's own fields after it."""
 
 
 def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[FieldText]:
-    """Yield all fields of a schema, each section before its fields. A map of sections is described by one entry."""
+    """Yield all settings of a schema, each section before its own fields. A map of sections has one entry, named `<name>`."""
     instance = schema() if defaults is None else defaults
     for field in dataclasses.fields(schema):  # type: ignore[arg-type]
         if not field.compare or field.name == "task":
@@ -77,13 +77,13 @@ def _meanings(schema: type) -> dict[str, str]:
 
 
 def meaning_of(schema: type, name: str) -> str:
-    """Return the docstring of a field: that of the class, else of its nearest base class. It may be empty."""
+    """Return the docstring of a field in `schema`, or else in the nearest base class; '' for a field without a docstring."""
     classes = [kind for kind in schema.__mro__ if dataclasses.is_dataclass(kind)]
     return next((_meanings(kind)[name] for kind in classes if name in _meanings(kind)), "")
 
 
 def kind_of(hint: Any) -> str:
-    """Return a text for the values that a field of this type accepts."""
+    """Describe in words the values that a field of the type `hint` accepts."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Literal:
         return f"one of {', '.join(f'`{arg}`' for arg in args)}"
@@ -102,7 +102,7 @@ def kind_of(hint: Any) -> str:
 
 
 def bounds_of(metadata: Mapping[str, Any]) -> str:
-    """Return a text for the bounds of a field."""
+    """Describe in words the bounds in the metadata of a field; '' without bounds."""
     low, high = metadata.get("min"), metadata.get("max")
     parts = []
     if "above" in metadata and high is not None:

@@ -16,14 +16,15 @@ REPLACED: dict[str, tuple[str, dict[str, str | None]]] = {
     "sim.constraint_solver": ("sim.step", {"auto": None, "fused": "fused", "rounds": "library"}),
     "sim.smooth_dynamics": ("sim.step", {"auto": None, "fused": "fused", "stages": "library"}),
 }
-"""Old dotted path -> (new dotted path, map: old value -> new value). A new value of None leaves the default."""
+"""Old dotted path -> (new dotted path, map: old value -> new value). If the new value is None, the old setting is dropped."""
 
 
 def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return a copy of `data` with old names replaced.
 
     Raises:
-        ConfigError: a setting has both its old and its new name; the text begins with `source`.
+        ConfigError: `data` has a setting under its old and its new name, or an old setting has an unknown value. The message
+            begins with `source`.
     """
     result = _replaced(data, source)
     for old, new in RENAMED.items():
@@ -33,7 +34,7 @@ def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
             continue
         value = found[key]
         result[section] = {name: item for name, item in found.items() if name != key}
-        _put(result, new.split("."), value, f"{source}: {old}: {shown(value)}: renamed {new}, which is set too")
+        _put(result, new.split("."), value, f"{source}: {old}: {shown(value)}: renamed to {new}, which is set too")
     return result
 
 
@@ -57,7 +58,7 @@ def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _put(data: dict[str, Any], path: list[str], value: Any, conflict: str) -> None:
-    """Set the value at a path of keys, in copies of the maps on the way. An existing value is the error `conflict`."""
+    """Set the value at a path of keys. Maps on the path are copied. An existing value raises ConfigError(conflict)."""
     key, *rest = path
     if not rest:
         if key in data:

@@ -1,7 +1,8 @@
-"""Rescaling of a configuration's numbers from its reference robot to another robot, by dynamic similarity.
+"""Rescaling of a configuration's numbers from its reference robot to the task's robot, by dynamic similarity.
 
-Only numbers with a unit are rescaled. `rescaled` (bounds.py) sets the unit of a field. Scales and noise of a term have the
-unit that `@unit` declares. Sizes of a terrain type and ranges of a property have the unit of that type or property.
+Only numbers with a unit are rescaled. `rescaled` (bounds.py) sets the unit of a field. Scales, noise and bias of a term are
+rescaled by the unit that `@unit` declares above the term's method. Sizes of a terrain have the unit of the terrain type.
+Ranges of a property have the unit of the property.
 """
 
 import dataclasses
@@ -12,16 +13,16 @@ from typing import Any
 from legged.config.checks import hints_of
 
 Factor = Callable[[str], float]
-"""Function: unit -> factor that converts a quantity of that unit from the reference robot to the other robot."""
+"""Function: unit -> factor that converts a quantity of that unit from the reference robot to the task's robot."""
 UnitOf = Callable[[str], str]
 """Function: name -> unit. The name is that of a term's method, such as "_reward_torques", or the dotted path of an entry,
 such as "terrain.sizes.step"."""
 DIGITS = 6
-"""Significant digits of a rescaled number, few enough to read."""
+"""Number of significant digits of a rescaled number. More digits would be hard to read."""
 
 
 def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: UnitOf) -> dict[str, Any]:
-    """Return a copy of the nested values `data`, which fit `schema`. All numbers that have a unit are rescaled."""
+    """Return a copy of `data` in which all numbers with a unit are rescaled. `data` are nested values that fit `schema`."""
     fields = {f.name: f for f in dataclasses.fields(schema)}
     hints = hints_of(schema)
     rescaled: dict[str, Any] = {}
@@ -50,14 +51,14 @@ def _of_sections(hint: Any) -> bool:
 
 
 def _times_entry(value: Any, by: float) -> Any:
-    """Return an entry of a map times a factor. In a section only `range` and `std` change, which have the entry's unit."""
+    """Return a map's entry times `by`. In a section, only `range` and `std` have the entry's unit and are multiplied."""
     if not isinstance(value, Mapping):
         return times(value, by)
     return {key: times(item, by) if key in ("range", "std") else item for key, item in value.items()}
 
 
 def times(value: Any, by: float) -> Any:
-    """Return a number, or all numbers in a list or map, times a factor. A factor of 1 keeps them exactly as written."""
+    """Return `value` with all its numbers multiplied by `by`. A factor of 1 keeps the numbers exactly as written."""
     if by == 1.0:
         return value
     if isinstance(value, Mapping):

@@ -7,24 +7,25 @@ from legged.config.bounds import between, rescaled
 
 @dataclass(frozen=True)
 class HeightMapConfig:
-    """Errors of the map from which a robot reads the term `heights`, in addition to the term's noise, delay and lost packets.
-    They appear only in groups with `noise: true`. Half widths are those of uniform distributions around 0.
+    """Errors of the height map from which a robot reads the observation term `heights`. The term's bias, noise, delay and
+    lost packets come in addition. The errors of the map appear only in groups with `noise: true`. Each half width is that
+    of a uniform distribution around 0.
     """
 
     offset: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
-    """Half width of a common error of all heights, sampled for each episode [m]."""
+    """Half width of the map's vertical offset [m]. The offset is sampled for each episode."""
     shift: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
-    """Half width of the map's displacement along each horizontal world axis, sampled for each episode [m]."""
+    """Half width of the map's shift along each horizontal world axis [m]. The shift is sampled for each episode."""
     drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
-    """Half width of the speed at which the heights' common error drifts, sampled for each episode [m/s]."""
+    """Half width of the speed at which the vertical offset drifts [m/s]. The speed is sampled for each episode."""
     shift_drift: float = field(default=0.0, metadata=rescaled("m/s", between(0, 100)))
-    """Half width of the speed at which the map's displacement drifts along each axis, sampled for each episode [m/s]."""
+    """Half width of the speed at which the shift drifts along each axis [m/s]. The speed is sampled for each episode."""
     holes: float = field(default=0.0, metadata=between(0, 1))
-    """Share of the points that the map lacks. Different points are missing in each episode. A missing point reads 0, like
-    level ground under a robot whose base is `heights_offset` high."""
+    """Share of the map's points that are missing. Different points are missing in each episode. The observation of a missing
+    point is 0, as on level ground with the base at the height `observations.heights_offset`."""
     lost: float = field(default=0.0, metadata=between(0, 1))
-    """Probability that a robot has no map in an episode and must walk blindly. Success on terrain is measured with robots
-    that have a map."""
+    """Probability that a robot has no map during an episode and must walk blindly. When success on terrain is measured, all
+    robots have a map."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Configuration of any kind of task. A task class with more sections has a subclass of TaskConfig as its `Config`."""
+"""Configuration of any kind of task. If a task class has more sections, its `Config` is a subclass of TaskConfig."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
@@ -33,13 +33,13 @@ class TaskConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
     """Settings of the learner."""
     custom: dict[str, Any] = field(default_factory=dict)
-    """Free section for user-defined terms: `self.cfg.custom["name"]`."""
+    """Free section for user-defined terms, which read it as `self.cfg.custom["name"]`."""
     origins: Origins = field(default_factory=Origins, repr=False, compare=False)
-    """Sources of the settings. `compare=False` marks that this is no setting: files neither set nor store it."""
+    """Sources of the settings. `compare=False` marks that this field is not a setting, so files neither set nor store it."""
 
     def trained(self) -> Self:
-        """Return the configuration for play and evaluation of a trained policy: without randomisation, and with the
-        observations of a trained policy.
+        """Return the configuration for play and evaluation of a trained policy. Domain randomisation is off, and the settings
+        of the observations are those that `observations.trained()` returns.
         """
         return replace(self, domain_rand=self.domain_rand.nominal(), observations=self.observations.trained())
 

@@ -21,7 +21,7 @@ BASE = {
 """Unit -> exponents of mass, length and time. Angles have no dimension."""
 Exponents = tuple[int, int, int]
 SPELLINGS = {"**": "^", "*": " ", "·": " ", "²": "^2", "³": "^3", "⁴": "^4", "⁻": "^-", "^-^": "^-", "¹": "1"}
-"""Other spellings of powers and products -> the spelling used here."""
+"""Accepted spelling of a power or product -> the spelling that `_parsed` reads."""
 TOKENS = re.compile(r"[A-Za-z]+|\^-?\d+|\S")
 
 
@@ -47,8 +47,8 @@ def _parsed(text: str) -> Exponents | None:
 
 
 def _product(words: list[str]) -> Exponents | None:
-    """Take a product from the front of `words`, up to a closing bracket. Return its exponents, or None if it is not a unit.
-    Everything after a slash is in the denominator.
+    """Remove a product of units from the front of `words`, up to a closing bracket. Return the exponents of the product; None
+    if a word is not a unit. Everything after a slash is in the denominator.
     """
     mass, length, time, sign = 0, 0, 0, 1
     while words and words[0] != ")":
@@ -67,7 +67,7 @@ def _product(words: list[str]) -> Exponents | None:
 
 
 def factor(unit: str, scale: Mapping[str, float]) -> float:
-    """Return the factor on a quantity of this unit if masses, lengths and times are multiplied by scale["kg"], scale["m"] and
+    """Return the factor on a quantity of `unit` if masses, lengths and times are multiplied by scale["kg"], scale["m"] and
     scale["s"].
     """
     mass, length, time = exponents(unit)

@@ -1,4 +1,4 @@
-"""Conversion between YAML texts and plain values. An error in a file is one line that names the file and the line in it."""
+"""Conversion between YAML texts and plain values. An error message names the file and, if known, the line of the mistake."""
 
 import contextlib
 import re
@@ -12,8 +12,8 @@ from legged.config.checks import shown
 from legged.errors import ConfigError
 
 MOST_BYTES = 250_000
-"""Size of the largest file that is read [bytes]. A complete configuration has 6000 bytes. PyYAML already needs seconds to
-read a file of this size."""
+"""Size of the largest file that is read [bytes]. A complete configuration has 6000 bytes. PyYAML needs seconds to
+read 250 000 bytes."""
 DEEPEST = 40
 """Deepest nesting of maps and lists."""
 MOST_VALUES = 100_000
@@ -21,8 +21,8 @@ MOST_VALUES = 100_000
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that reads `1e-4` and `-.5` as numbers, unlike YAML 1.1. It refuses repeated keys, numbers that YAML 1.2
-    reads differently, and texts that would take forever to read.
+    """SafeLoader that also reads `1e-4` and `-.5` as numbers; PyYAML's SafeLoader reads them as texts. This class refuses
+    repeated keys, whole numbers that differ between YAML 1.1 and 1.2, deep nesting, and too many values.
     """
 
     def get_single_node(self) -> yaml.Node | None:
@@ -33,7 +33,7 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node as the parser does, but refuse deep nesting, because the parser would recurse without limit."""
+        """Compose a node as SafeLoader does. Refuse deep nesting, which would exceed Python's recursion limit."""
         self._depth = getattr(self, "_depth", 0) + 1
         if self._depth > DEEPEST:
             raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} nested blocks", problem_mark=self.get_mark())
@@ -43,7 +43,7 @@ class _Loader(yaml.SafeLoader):
             self._depth -= 1
 
     def _measure(self, node: yaml.Node) -> tuple[int, int]:
-        """Return the number of values in a node and their depth, with aliases expanded."""
+        """Return the number of values in a node and the depth of its nesting, both after aliases are expanded."""
         if isinstance(node, yaml.ScalarNode):
             return 1, 1
         if id(node) in self._sizes:
@@ -56,14 +56,14 @@ class _Loader(yaml.SafeLoader):
         parts = [self._measure(part) for part in inner]
         size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
         if size > MOST_VALUES or depth > DEEPEST:
-            self._refuse(f"aliases stand for more than {MOST_VALUES} values, or {DEEPEST} nested blocks", node)
+            self._refuse(f"more than {MOST_VALUES} values or {DEEPEST} nested blocks after aliases are expanded", node)
         self._sizes[id(node)] = size, depth
         if isinstance(node, yaml.MappingNode):
             self._refuse_key_given_twice(node)
         return size, depth
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Refuse a repeated key. Later the merge keys `<<` are expanded, and a block may override keys that it merges."""
+        """Refuse a repeated key. Called before merge keys (`<<`) are expanded, because a block may override a merged key."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -80,7 +80,7 @@ class _Loader(yaml.SafeLoader):
         number: int = super().construct_yaml_int(node)
         digits = node.value.replace("_", "")
         if ":" in digits or (re.fullmatch(r"[-+]?0\d+", digits) and int(digits) != number):
-            raise ValueError("YAML 1.1 and 1.2 read it differently")
+            raise ValueError("YAML 1.1 and 1.2 read this number differently")
         return number
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
@@ -98,7 +98,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that quotes texts that the loader above would read as numbers."""
+    """SafeDumper that quotes texts such as '1e-4', which `_Loader` would read as numbers if they had no quotes."""
 
 
 for _kind in (_Loader, _Dumper):
@@ -136,10 +136,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str, source: str) -> Any:
-    """Return the value of a YAML text from `source`.
+    """Return the value of a YAML text. Error messages begin with `source`, such as the path of the text's file.
 
     Raises:
-        ConfigError: the text is malformed, refers to itself, or is too large after its aliases are expanded.
+        ConfigError: the text is malformed, has an anchor that refers to itself, or is too large after aliases are expanded.
     """
     with _as_one_line(source):
         loader = _Loader(text)

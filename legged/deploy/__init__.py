@@ -1,3 +1,3 @@
-"""The program that runs an exported policy on a robot. It needs numpy and onnxruntime. Of the rest of this package it imports
-only `errors` and `process`.
+"""The program that runs an exported policy on a robot. It needs numpy and onnxruntime. From other parts of legged it
+imports only `legged.errors` and `legged.process`.
 """

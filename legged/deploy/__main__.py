@@ -1,8 +1,8 @@
 """The robot's program: `python -m legged.deploy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
-It runs the policy that play.py exported into FOLDER (policy.onnx and policy.json) at the policy's rate, follows the keyboard,
-a gamepad or a file of commands, and writes a log. It needs numpy and onnxruntime; Unitree's robots need the extra
-`unitree-sdk2` too.
+The program runs the exported policy in FOLDER (policy.onnx and policy.json) at the policy's rate. Commands come from the
+keyboard, a gamepad or a file. At its end the program writes a log. It needs numpy and onnxruntime, and for Unitree's robots
+also the extra `unitree-sdk2` of the package.
 """
 
 import argparse
@@ -26,10 +26,10 @@ from legged.process.command_parser import CommandParser, argument, check_between
 from legged.process.paths import ready_to_write
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
-"""Signals at which the program brakes the robot and then ends: Ctrl-C, kill, a closed terminal or a lost connection, Ctrl-\\
-and Ctrl-Z. By default most of them would leave the robot with its last command."""
+"""Signals at which the program brakes the robot and then ends. They come from Ctrl-C, `kill`, a closed terminal, Ctrl-\\ and
+Ctrl-Z. Most of these signals would otherwise end or pause the program without braking the robot."""
 SWITCH_S = 5e-4
-"""Python's switch interval between threads [s]; the default of 5 ms is a quarter of a cycle."""
+"""Python's switch interval between threads [s]. Python's default, 5 ms, is a quarter of a 50 Hz cycle."""
 EXIT_STOPPED = 3
 """Exit code of a program that ran to its end, but had stopped the robot for safety."""
 PROGRAM = (
@@ -38,8 +38,10 @@ PROGRAM = (
     argument("--commands", type=Path, help="file of commands, in place of a keyboard or gamepad"),
     argument("--seconds", type=float, default=float("inf"), help="end after this time [s]; default: when the operator quits"),
     argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3"),
-    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop above this [rad]; default {Limits.max_tilt:g}"),
-    argument("--max-age", type=float, default=Limits.max_age_s, help=f"stop at older data [s]; default {Limits.max_age_s:g}"),
+    argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop at more tilt [rad]; default {Limits.max_tilt:g}"),
+    argument(
+        "--max-age", type=float, default=Limits.max_age_s, help=f"largest age of data [s]; default {Limits.max_age_s:g}"
+    ),
     argument(
         "--max-missed",
         type=int,
@@ -95,7 +97,7 @@ def _main(argv: list[str] | None) -> int:
         raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
     ready_to_write(args.log.parent)
     policy = Policy(args.policy)
-    if args.robot in KINDS:  # a wrong policy is refused before the robot leaves its own controller
+    if args.robot in KINDS:  # refuse a wrong policy before UnitreeRobot ends the robot's own controller
         policy.contract.check_fits(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
@@ -126,8 +128,8 @@ def _main(argv: list[str] | None) -> int:
 
 
 def limits_of(args: argparse.Namespace) -> Limits:
-    """Return the limits that the flags set, in seconds, radians and cycles. Their ranges refuse a tilt in degrees or an age
-    in milliseconds.
+    """Return the limits that the flags set, in seconds, radians and cycles. Each flag has an allowed range, which excludes
+    typical mistakes: a tilt in degrees or an age in milliseconds.
 
     Raises:
         ConfigError: a number is outside its range.
@@ -155,8 +157,8 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 
 class Interruptible(Operator):
-    """An operator that also ends the program at signals such as Ctrl-C (`ENDING`). A connected robot is braked first; without
-    a robot the program ends at once.
+    """An operator that also ends the program when a signal of `ENDING` arrives, such as Ctrl-C. If a robot is connected, the
+    program brakes the robot first. Without a robot the program ends at once.
     """
 
     def __init__(self, operator: Operator) -> None:
@@ -171,7 +173,7 @@ class Interruptible(Operator):
         self._ends = True
 
     def take(self) -> None:
-        """Note that a robot is connected, so that signals brake it first."""
+        """Record that a robot is connected. From now on, a signal brakes the robot first, and then ends the program."""
         self._has_robot = True
 
     def poll(self, seconds: float) -> Orders:

@@ -1,4 +1,4 @@
-"""The contract of an exported policy: policy.json, and its comparison with the exported files and with a robot."""
+"""The contract of an exported policy (policy.json), and checks that the exported files and a robot agree with it."""
 
 import hashlib
 import json
@@ -27,14 +27,14 @@ SENSORS = {
     "dof_vel": "joint velocities",
     "actions": "memory",
 }
-"""Observation term -> sensor, command or memory that it needs, for the terms that every robot can provide."""
+"""Observation term -> its input: a sensor, the command, or the last actions ("memory"). Every robot has these inputs."""
 SOURCE = "source "
-"""Prefix of the need of any other term, before the name of its source, as in "source heights"."""
+"""Prefix before the name of an additional source, as in "source heights". Terms that are not in SENSORS need a source."""
 SCANS = ("lowest", "own", "highest")
-"""Values that a point of the heights can read: the lowest height of its cell and the next cells in x and y, the height of its
-own cell, or the highest of the three."""
+"""Ways to read a height map at a point. "own" is the height of the point's cell; "lowest" and "highest" are taken from three
+cells: the point's cell and its neighbours in +x and +y."""
 TOLERANCE = 1e-3
-"""Largest difference, absolute or relative, at which limits count as equal."""
+"""Largest difference at which limits count as equal: absolute for joint angles [rad], relative for torques and speeds."""
 DEEPEST, MOST_DIGITS = 20, 18
 """Deepest nesting, and largest number of digits of a whole number, in JSON from files and packets."""
 RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
@@ -59,30 +59,30 @@ def plain_json(text: str | bytes) -> Any:
 
     def whole(digits: str) -> int:
         if len(digits) > MOST_DIGITS:
-            raise ValueError(f"has a whole number of {len(digits)} digits")
+            raise ValueError(f"a whole number has {len(digits)} digits, more than {MOST_DIGITS}")
         return int(digits)
 
     try:
         value = json.loads(text, parse_int=whole)
     except RecursionError as error:
-        raise ValueError("is nested too deeply") from error
+        raise ValueError("the JSON text is nested too deeply") from error
     level = [value]
     for _ in range(DEEPEST):
         parts = [part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list)]
         level = [inner for part in parts for inner in part]
     if level:
-        raise ValueError("is nested too deeply")
+        raise ValueError("the JSON text is nested too deeply")
     return value
 
 
 def need_of(term: str) -> str:
-    """Return the need of an observation term: its entry in SENSORS, else a source with the term's name."""
+    """Return the input of an observation term: its entry in SENSORS or, if it has none, the source with the term's name."""
     return SENSORS.get(term, f"{SOURCE}{term}")
 
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the observation. In the oldest observation of its group it has the columns `start` to `start + size`."""
+    """A term of the observation. `start` is the column of the term's first number in the oldest observation of its group."""
 
     name: str
     start: int
@@ -92,15 +92,15 @@ class Term:
     source: str | None
     """Source that the term needs; None if sensors suffice."""
     points: np.ndarray | None
-    """(P, 2) points at which a height map is read, x forward and y left of the base [m]; None for other terms."""
+    """(P, 2) points at which a height map is read, x forward and y left of the base [m]; None if the term reads no map."""
     offset: float
-    """Distance below the base from which observed heights are measured [m]."""
+    """Observed heights are relative to a level that lies below the base by this distance [m]."""
     limit: float
     """Largest observed height [m]."""
     deepest: float
     """Largest observed depth of low ground [m]."""
     scan: str
-    """Value that a point reads from a map of cells, one of `SCANS`."""
+    """Way to read the height map at a point, one of `SCANS`."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class Group:
 
 @dataclass(frozen=True)
 class Contract:
-    """Requirements of a policy for a robot with D joints, A of which have an action; SI units."""
+    """Requirements that a policy makes on a robot. The robot has D joints; A of them have an action. Units are SI."""
 
     path: Path
     entries: Mapping[str, Any]
-    """Contents of the file, as plain data."""
+    """Contents of policy.json, as plain data."""
     task: str
     robot: str
     imu_body: str
@@ -152,7 +152,7 @@ class Contract:
     control_dt: float
     """Time for which an action is held [s]."""
     sim_dt: float
-    """Physics step of the training; the unit of the actuator's delay [s]."""
+    """Physics step in training [s]. The actuator's delay is a number of these steps."""
     actuator: Mapping[str, Any]
     """Section control.actuator of the training's configuration; empty if the export lacks it."""
     states: Mapping[str, tuple[int, int, int]]
@@ -170,11 +170,11 @@ class Contract:
 
     @property
     def sources(self) -> dict[str, Term]:
-        """Return source -> a term that needs it."""
+        """Return a dictionary: source -> a term that needs this source."""
         return {term.source: term for term in self.terms if term.source is not None}
 
     def check_metadata(self, network: Path, metadata: Mapping[str, str]) -> None:
-        """Compare all entries with `metadata` of the ONNX file `network`: key -> JSON text.
+        """Compare all entries except NOT_COMPARED with the `metadata` (key -> JSON text) of the ONNX file `network`.
 
         Raises:
             ConfigError: the metadata are no contract, or come from another export.
@@ -184,17 +184,19 @@ class Contract:
         except ValueError:
             inside = {}
         if "contract_version" not in inside:
-            raise ConfigError(f"{network}: has no metadata of an export; its entries must equal {self.path}")
+            raise ConfigError(
+                f"{network}: has no metadata of an export, so {self.path} cannot be checked; export the policy again"
+            )
         for key in sorted({*inside, *self.entries} - NOT_COMPARED):
             if key not in inside or key not in self.entries or inside[key] != self.entries[key]:
-                raise ConfigError(f"{self.path}: {key}: differs from that of {network}; the files are from different exports")
+                raise ConfigError(f"{self.path}: {key}: {network} has another value; the files are from different exports")
 
     def check_fits(self, robot: RobotFacts) -> None:
         """Compare the contract with a robot.
 
         Raises:
-            ConfigError: the robot's joints have other names or another order, or are weaker, slower or stop earlier than in
-                the training; its IMU is in another body; or it lacks a source that an observation needs.
+            ConfigError: joints of the robot differ in name or order, or have less torque, speed or range than in training;
+                the robot's IMU is in another body; or the robot lacks a source that an observation needs.
         """
         if self.joint_names != robot.joint_names:
             raise ConfigError(f"{self.path}: joint_names: {_difference(self.joint_names, robot.joint_names, robot.name)}")
@@ -205,7 +207,7 @@ class Contract:
             )
         for name, unit in (("torque_limits", "N m"), ("velocity_limits", "rad/s")):
             for joint, mine, its in zip(self.joint_names, getattr(self, name), getattr(robot, name), strict=True):
-                if not mine <= its * (1.0 + TOLERANCE):  # also true for a limit of NaN
+                if not mine <= its * (1.0 + TOLERANCE):  # a limit of NaN is refused, too
                     trained = f"the policy was trained with {mine:g} {unit} at '{joint}'"
                     raise ConfigError(f"{self.path}: {name}: {trained}, but '{robot.name}' has {its:g}")
         for joint, mine, its in zip(self.joint_names, self.position_limits, robot.position_limits, strict=True):
@@ -224,11 +226,11 @@ class Contract:
 
 
 def read_contract(path: Path) -> Contract:
-    """Return the contract in a policy.json, after checking the exported files next to it against its checksums.
+    """Return the contract in a policy.json. Check exported files in the same folder against the checksums in policy.json.
 
     Raises:
         ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
-            invalid values; or an exported file does not have its checksum.
+            invalid values; or the checksum of an exported file is wrong.
     """
     try:
         said = plain_json(path.read_bytes())
@@ -238,10 +240,10 @@ def read_contract(path: Path) -> Contract:
             raise ConfigError(f"{path}: task: '{said.get('task')}' is no task of a legged robot that follows commands")
         version = said.get("contract_version")
         if version != CONTRACT_VERSION:
-            was = "none, because an older version wrote it" if version is None else f"{version!r}"
+            was = "none (an older version of legged wrote the file)" if version is None else f"{version!r}"
             raise ConfigError(
-                f"{path}: contract_version: got {was}; this program reads {CONTRACT_VERSION}; export the policy again"
-                f" (legged play {said.get('task')} --no-video)"
+                f"{path}: contract_version: got {was}, but this program reads {CONTRACT_VERSION};"
+                f" export the policy again with `legged play {said.get('task')} --no-video`"
             )
         if (control := said.get("control_type")) != "P":
             raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
@@ -249,7 +251,7 @@ def read_contract(path: Path) -> Contract:
         for name, digest in said.get(CHECKSUMS, {}).items():
             file = path.with_name(name)
             if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != digest:
-                raise ConfigError(f"{file}: is not the file that was exported with {path} ({CHECKSUMS}); export it again")
+                raise ConfigError(f"{file}: is not the file exported with {path} ({CHECKSUMS}); export the policy again")
     except ConfigError:
         raise
     except (OSError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
@@ -321,7 +323,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
 
 
 def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]:
-    """Yield the groups. Check that a robot with this number of joints can give their terms, and that columns have no gaps."""
+    """Yield the groups of terms. Refuse terms that do not fit a robot with `joints` joints, and gaps between columns."""
     sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
     sizes["actions"] = len(said["action_joints"])
     names = [entry["name"] for entry in said["observation_groups"]]

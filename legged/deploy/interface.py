@@ -9,12 +9,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class RobotFacts:
-    """Properties of a robot with D joints. The joints have the order of readings and commands."""
+    """Properties of a robot with D joints. Readings and commands have the joints in the same order as `joint_names`."""
 
     name: str
     joint_names: tuple[str, ...]
     position_limits: np.ndarray
-    """(D, 2) [rad]; infinite without a limit."""
+    """(D, 2) [rad]; infinite for a joint without a limit."""
     velocity_limits: np.ndarray
     """(D,) [rad/s]."""
     torque_limits: np.ndarray
@@ -32,7 +32,7 @@ class Reading:
     time: float
     """Time of the robot's clock [s]."""
     received: float
-    """Time of arrival on this machine, as `time.perf_counter` [s]."""
+    """Time of arrival on this machine, on the clock of `time.perf_counter` [s]."""
     quaternion: np.ndarray
     """(4,) w, x, y, z; rotation from the frame of `RobotFacts.imu_body` to the world frame, whose z axis points up."""
     gyro: np.ndarray
@@ -46,10 +46,10 @@ class Reading:
     temperatures: np.ndarray | None = None
     """(D,) temperatures of the motors [degrees Celsius]; None if unknown."""
     sources: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Source -> newest value: `base_lin_vel` (3,) in the frame of the IMU's body [m/s]; `heights` (P,) of the ground at the
-    requested points, relative to the base [m]; others in the form of their observation terms."""
+    """Source -> newest value. `base_lin_vel` (3,) is in the frame of the IMU's body [m/s]. `heights` (P,) are ground heights
+    at the requested points, relative to the base [m]. Any other source has the unscaled values of the term with its name."""
     stop: bool = False
-    """The operator requests a stop by the robot's remote control."""
+    """True if the operator requests a stop with the robot's remote control."""
 
 
 class Interface(ABC):
@@ -59,7 +59,9 @@ class Interface(ABC):
 
     @abstractmethod
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Request sources from now on: `heights` -> its points (P, 2), x forward, y left of the base [m]; others -> None."""
+        """Request these sources for all later readings. The value of `heights` is its points (P, 2), x forward and y left of
+        the base [m]. The value of any other source is None.
+        """
 
     @abstractmethod
     def read(self) -> list[Reading]:
@@ -67,8 +69,8 @@ class Interface(ABC):
 
     @abstractmethod
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
-        """Command the torques stiffness * (positions - q) - damping * dq until the next call. Each argument is (D,): [rad],
-        [N m/rad], [N m s/rad].
+        """Command the torques stiffness * (positions - q) - damping * dq until the next call. The arguments have the shape
+        (D,) and the units [rad], [N m/rad] and [N m s/rad].
         """
 
     @abstractmethod

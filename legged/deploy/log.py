@@ -1,4 +1,4 @@
-"""Log of a run: readings with the targets at their time, cycles of the program, and samples for fitting actuators."""
+"""Log of a run: readings with joint targets and gains, cycles of the program, and samples for fitting actuators."""
 
 import json
 from collections import deque
@@ -16,14 +16,14 @@ from legged.process.paths import make_folder, replacing
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
 MOST_READINGS, MOST_CYCLES = 300_000, 60_000
-"""Largest numbers of rows; older rows are dropped. They last for 20 minutes at 250 readings and 50 cycles per second."""
+"""Largest numbers of readings and cycles. At 250 readings and 50 cycles a second, a log covers its last 20 minutes."""
 SHORTEST = 20
-"""Smallest number of samples without a gap that is used for fitting."""
+"""Smallest number of samples in an uninterrupted sequence. Shorter sequences are not used for fitting actuators."""
 UNEVEN = 0.75
-"""Largest deviation of the time between two samples, as a share of a time step. A clock with a resolution of 1 ms alternates
-between 2 and 3 ms at 400 Hz; a missing sample adds a whole step."""
+"""Largest deviation of the time between two consecutive samples from the usual time step, as a share of that step. At 400 Hz,
+a clock with 1 ms resolution shows steps of 2 and 3 ms, which must be accepted. A missing sample adds a whole step."""
 MEASURED = {"position": "positions", "velocity": "velocities", "torque": "torques"}
-"""Array of the samples for fitting -> array of the log."""
+"""Name of an array of the samples for fitting -> name of the same array in the log."""
 
 
 class Log:
@@ -58,12 +58,12 @@ class Log:
             self._readings.setdefault(name, deque(maxlen=MOST_READINGS)).append(value)
 
     def add_cycle(self, state: State, **row: float | np.ndarray) -> None:
-        """Add a cycle of the program: its state, and values by name; all cycles have the same names."""
+        """Add a cycle of the program: the program's state and named values. All cycles must have the same names."""
         for name, value in {"state": STATES.index(state.value), **row}.items():
             self._cycles.setdefault(name, deque(maxlen=MOST_CYCLES)).append(np.copy(value))
 
     def note(self, seconds: float, text: str) -> None:
-        """Add a note, such as a change of state, at a time after the start [s]."""
+        """Add a note, such as a change of state. `seconds` is the time since the start of the run [s]."""
         self._notes.append((seconds, text))
 
     @property
@@ -74,11 +74,12 @@ class Log:
     def save(self, path: Path) -> None:
         """Write the log.
 
-        Arrays by reading: `times` of the robot's clock [s], `received` of this machine's clock [s], `targets` (T, D) [rad],
-        `stiffness`, `damping`, `positions` [rad], `velocities` [rad/s], `torques` [N m] and `temperatures` [degrees Celsius],
-        both NaN if unknown, `quaternions` (T, 4), `gyro` (T, 3), and `state` (T,), an index into `states`. Arrays by cycle:
-        the values of `add_cycle`, with the prefix `cycle_`. Others: `joint_names`, `states`, `notes`, `note_times` [s] and
-        `contract` (JSON). Samples for fitting actuators, if there are any, go to a second file with the suffix `ACTUATORS`.
+        Arrays with a row for each reading: `times` (robot's clock) and `received` (this machine's clock) (T,) [s]; `targets`
+        and `positions` [rad], `stiffness`, `damping`, `velocities` [rad/s], `torques` [N m], `temperatures` [degrees Celsius]
+        (T, D); `quaternions` (T, 4); `gyro` (T, 3); `state` (T,), an index into `states`. Unknown torques and temperatures
+        are NaN. Arrays with a row for each cycle: the values of `add_cycle`, with the prefix `cycle_`. Further arrays:
+        `joint_names`, `states`, `notes`, `note_times` [s] and `contract` (JSON).
+        Samples for fitting actuators, if there are any, go to a second file, whose name has `ACTUATORS` before .npz.
 
         Raises:
             RunError: a file cannot be written.
@@ -103,11 +104,12 @@ class Log:
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:
-    """Return the samples for fitting from a log (arrays of `Log.save`); None if it has too few. They are the evenly spaced
-    readings with the policy's gains and with torques.
+    """Return the samples for fitting actuators, or None if the log has too few. The samples are readings with known torques
+    and with the policy's gains. `log` has the arrays of `Log.save`.
 
-    A missing reading ends a run; repeated readings are left out. The arrays are `joint_names` (D,), `run` (T,), `dt` [s],
-    `target`, `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the gains `stiffness`, `damping` (D,).
+    A gap between samples begins a new sequence. Repeated readings are left out. The arrays are `joint_names` (D,), `dt` [s],
+    `run` (T,) (number of the sequence), `target` and `position` [rad], `velocity` [rad/s], `torque` [N m] (T, D), and the
+    gains `stiffness` and `damping` (D,).
     """
     if "times" not in log:
         return None
@@ -116,7 +118,7 @@ def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[s
         usable &= np.isfinite(log[name]).all(axis=1)
     new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
     rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
-    if len(rows) < SHORTEST:  # also without a clock, when all readings have the same time
+    if len(rows) < SHORTEST:  # if the robot has no clock, all readings have the same time, and one is new
         return None
     steps = np.diff(log["times"][rows])
     usual = float(np.median(steps))

@@ -1,4 +1,4 @@
-"""The operator of a robot: states and events of the program, and commands by a keyboard, a gamepad or a file.
+"""States and events of the program, and the operators that command a robot: a keyboard, a gamepad or a file.
 
 An event of Linux's joystick device is 8 bytes: time [ms] uint32, value int16, type uint8 (1 button, 2 axis, plus 0x80 for
 events that report the initial state), number uint8 (Linux, Documentation/input/joydev/joystick-api.rst).
@@ -27,17 +27,17 @@ class State(Enum):
     IDLE = "idle"
     """No torque."""
     DAMPING = "damping"
-    """Joints are braked: the robot sinks to the ground."""
+    """Joints are braked, so the robot sinks to the ground."""
     STAND = "stand"
     """Joints move to the default pose, and hold it."""
     WALK = "walk"
     """The policy acts."""
     STOP = "stop"
-    """Joints are braked after a fault; only the operator can leave this state."""
+    """Joints are braked after a fault or a stop by the operator. Only the operator can end this state."""
 
 
 class Event(Enum):
-    """Request of the operator or of the safety checks."""
+    """Request of the operator."""
 
     IDLE = "idle"
     DAMPING = "damping"
@@ -54,11 +54,11 @@ TRANSITIONS = {
     State.WALK: (Event.STAND, Event.DAMPING, Event.STOP),
     State.STOP: (Event.DAMPING, Event.STOP),
 }
-"""State -> the allowed events, each of which leads to the state with the same name. All other events are refused."""
+"""State -> its allowed events. Each event leads to the state with the same name. `Event.QUIT` is allowed in all states."""
 MOVING = (State.STAND, State.WALK)
 """States in which the safety checks can stop the robot."""
 RAMP = np.array([1.0, 1.0, 2.0])
-"""Largest change of vx, vy [m/s^2] and yaw rate [rad/s^2]."""
+"""Largest rate of change of the commanded vx, vy [m/s^2] and yaw rate [rad/s^2]."""
 KEYS = {
     "0": Event.IDLE,
     "1": Event.DAMPING,
@@ -70,27 +70,27 @@ KEYS = {
     "\x03": Event.QUIT,
 }
 STEPS = {"w": (0, 1.0), "s": (0, -1.0), "a": (1, 1.0), "d": (1, -1.0), "q": (2, 1.0), "e": (2, -1.0)}
-"""Key -> axis of the command and sign."""
+"""Key -> (index in the command vx, vy, yaw rate; sign of the change)."""
 SEQUENCE = re.compile("\x1b[\\[O][0-?]*[ -/]*[@-~]")
-"""Sequences of arrow and function keys (ECMA-48, 5.4), which begin with the escape character and are ignored."""
+"""Escape sequences of arrow and function keys (ECMA-48, 5.4). They are ignored, although the escape key alone is a stop."""
 SILENCE_S = 10.0
-"""Time after the last key at which a command ends, because the operator may have left [s]."""
+"""Time without a key press after which the command becomes zero, because the operator may have left [s]."""
 STEP = 0.1
-"""Change of a command by one key, as a share of the largest command."""
+"""Change of a command per key press, as a share of the largest command."""
 JOYSTICK = struct.Struct("<IhBB")
 BUTTON, AXIS, AT_START = 1, 2, 0x80
 LARGEST = 32767.0
-"""Largest value of an axis."""
+"""Largest value that the joystick device reports for an axis."""
 STILL = 0.1
 """Dead zone of a stick as a share of its range."""
 DEVICE = Path("/dev/input/js0")
 AXES = {1: (0, -1.0), 0: (1, -1.0), 3: (2, -1.0)}
-"""Number of an axis -> axis of the command and sign: left stick up, left stick left and right stick left are positive."""
+"""Axis of the gamepad -> (index in the command vx, vy, yaw rate; sign). Sticks up and left give positive commands."""
 BUTTONS = {0: Event.WALK, 1: Event.STOP, 2: Event.DAMPING, 3: Event.STAND, 6: Event.QUIT, 7: Event.IDLE}
 """Number of a button -> event. On an Xbox gamepad these buttons are A, B, X, Y, back and start."""
 HELP = {
     "keyboard": "0 idle, 1 damping, 2 stand up, 3 walk, space stop, x quit; w s forward and back, a d left and right, q e"
-    f" turn, r no command; a command ends {SILENCE_S:g} s after the last key",
+    f" turn, r zero command; the command becomes zero {SILENCE_S:g} s after the last key press",
     "gamepad": "Y stand up, A walk, B stop, X damping, start idle, back quit; left stick walks, right stick turns",
 }
 
@@ -100,13 +100,13 @@ class Orders:
     """Present command and new events of the operator."""
 
     velocity: np.ndarray
-    """(3,) vx, vy [m/s], yaw rate [rad/s], or shares of the largest values if `shares`."""
+    """(3,) commanded vx, vy [m/s] and yaw rate [rad/s], or their shares if `shares` is true."""
     events: tuple[Event, ...] = ()
     """Events since the last poll, oldest first."""
     shares: bool = False
-    """True if `velocity` has shares, -1 to 1, of the policy's command ranges, such as the positions of a stick."""
+    """True if `velocity` holds shares of the policy's command ranges: -1 is the lowest command, and 1 the highest."""
     lost: str | None = None
-    """Reason why the operator can no longer be reached; None while it can."""
+    """Reason why the operator can no longer be reached; None while the operator is connected."""
 
 
 class Operator(ABC):
@@ -114,14 +114,14 @@ class Operator(ABC):
 
     @abstractmethod
     def poll(self, seconds: float) -> Orders:
-        """Return the orders `seconds` after the start of the program, without waiting."""
+        """Return the orders at the time `seconds` [s] after the start of the program. The call does not wait."""
 
     def close(self) -> None:  # noqa: B027  (most operators have nothing to release)
         """Release resources, such as a terminal."""
 
 
 class Ramp:
-    """Commands for the policy: clipped to its ranges, zero within its dead zone, and with a limited rate of change."""
+    """Limiter of commands. It clips them to the policy's ranges, zeroes speeds in the dead zone and limits their changes."""
 
     def __init__(self, contract: Contract) -> None:
         self._low, self._high = contract.command_ranges.T
@@ -129,7 +129,7 @@ class Ramp:
         self.command = np.zeros(3)
 
     def restart(self) -> None:
-        """Return to the command zero at once."""
+        """Set the command to zero at once."""
         self.command = np.zeros(3)
 
     def advance(self, orders: Orders) -> np.ndarray:
@@ -138,7 +138,7 @@ class Ramp:
         if orders.shares:
             velocity = np.where(velocity > 0.0, velocity * self._high, -velocity * self._low)
         velocity = np.nan_to_num(velocity)
-        # Zero stays allowed where the ranges exclude it, because a robot must always be able to stop.
+        # The command zero is always allowed, even outside the ranges, because a robot must always be able to stop.
         wanted = np.clip(velocity, self._low, self._high) if velocity.any() else np.zeros(3)
         if np.hypot(*wanted[:2]) < self._dead_zone:
             wanted[:2] = 0.0
@@ -194,7 +194,7 @@ class Script(Operator):
 
 
 class _Device(Operator):
-    """An operator with an open device. Commands are shares of the largest command. If the device is closed, it is lost."""
+    """Operator with an open device. Commands are shares of the largest command. An operator whose device closes is lost."""
 
     def __init__(self, descriptor: int, name: str) -> None:
         self._descriptor, self._name = descriptor, name
@@ -219,10 +219,10 @@ class _Device(Operator):
 
 
 class Keyboard(_Device):
-    """The terminal of the program, read key by key until `close`."""
+    """Keyboard of the program's terminal. Each key counts at once, without Enter. `close` restores the terminal's mode."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        """Open the terminal, by default standard input.
+        """Read keys from the terminal `descriptor`, by default standard input.
 
         Raises:
             ConfigError: there is no terminal.
@@ -257,7 +257,8 @@ class Keyboard(_Device):
     def close(self) -> None:
         import termios
 
-        with suppress(termios.error):  # the terminal may be closed. TCSANOW does not wait if Ctrl-S holds it
+        # A closed terminal raises an error. TCSANOW does not wait for output that Ctrl-S holds back.
+        with suppress(termios.error):
             termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
 
 

@@ -1,4 +1,4 @@
-"""Real time: priority, a fixed cycle rate with statistics, and status lines that never delay the robot."""
+"""Real-time operation: process priority, a fixed cycle rate with statistics, and status lines that never delay the robot."""
 
 import os
 import queue
@@ -12,13 +12,13 @@ import numpy as np
 PRIORITY = 20
 """Real-time priority of the process under Linux's SCHED_FIFO (1 to 99)."""
 END_S = 1.0
-"""Time for the last status lines to be printed at the end [s]."""
+"""Longest wait for the last status lines to be printed, at the end of the program [s]."""
 
 
 def take_priority(priority: int = PRIORITY) -> bool:
     """Request a real-time priority from Linux; return whether it was granted.
 
-    It requires a permission: a line `NAME - rtprio 20` in /etc/security/limits.conf.
+    Linux grants the priority to the user NAME if /etc/security/limits.conf has a line `NAME - rtprio 20`.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -28,7 +28,7 @@ def take_priority(priority: int = PRIORITY) -> bool:
 
 
 class Pace:
-    """A clock that begins a cycle every `dt` [s] after the first one, however long the cycles take."""
+    """A clock whose cycles are due every `dt` [s]. A cycle that takes too long does not shift later due times."""
 
     def __init__(
         self, dt: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], object] = time.sleep
@@ -41,7 +41,7 @@ class Pace:
         """Duration of each cycle [s]."""
         self._late: list[float] = []
         self.missed = self.missed_in_a_row = 0
-        """Missed deadlines; a cycle that takes two and a half periods misses two."""
+        """Numbers of missed deadlines, in total and in a row. A cycle that takes 2.5 periods misses two deadlines."""
 
     def wait(self) -> float:
         """Wait until the next cycle is due; return the time at which it begins [s]."""
@@ -72,7 +72,7 @@ class Pace:
         self._due += self._dt * overdue
 
     def line(self) -> str:
-        """Return durations, delays and missed deadlines of the cycles so far as a line of text, in milliseconds."""
+        """Return a line of text about all cycles so far: durations and delays [ms], and the number of missed deadlines."""
         took, late = np.array(self.took or [0.0]), np.percentile(self._late or [0.0], 99)
         named = {"mean": took.mean(), "p50": np.percentile(took, 50), "p99": np.percentile(took, 99), "max": took.max()}
         times = ", ".join(f"{name} {1e3 * value:.2f}" for name, value in named.items())
@@ -80,7 +80,7 @@ class Pace:
 
 
 class StatusMessages:
-    """Printer in its own thread, so that a held (Ctrl-S), closed or slow terminal does not delay the robot."""
+    """Printer of status lines in its own thread, so that a slow, closed or held (Ctrl-S) terminal cannot delay the robot."""
 
     def __init__(self, say: Callable[[str], object] | None = None) -> None:
         """Start the thread; `say` prints a line, by default to standard output."""
@@ -90,7 +90,7 @@ class StatusMessages:
         self._thread.start()
 
     def __call__(self, line: str) -> None:
-        """Queue a line."""
+        """Queue a line for printing."""
         self._lines.put(line)
 
     def _run(self) -> None:
@@ -99,6 +99,6 @@ class StatusMessages:
                 self._say(line)
 
     def close(self) -> None:
-        """Wait until all lines are printed, at most `END_S`."""
+        """Wait until all lines are printed, but at most `END_S`."""
         self._lines.put(None)
         self._thread.join(END_S)

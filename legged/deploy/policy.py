@@ -10,11 +10,11 @@ from legged.deploy.interface import Reading
 from legged.errors import ConfigError
 
 WARM_UP = 20
-"""Runs of the network at the start, because the first ones take ten times as long."""
+"""Number of trial runs after the network is loaded. The first runs of a network take ten times as long as later runs."""
 
 
 def gravity_in(quaternion: np.ndarray) -> np.ndarray:
-    """Return the unit vector along gravity (3,) in the frame that `quaternion` (w, x, y, z) rotates to the world frame."""
+    """Return the unit vector (3,) along gravity in the body frame. `quaternion` (w, x, y, z) rotates from body to world."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array([2.0 * (w * y - x * z), -2.0 * (y * z + w * x), 2.0 * (x * x + y * y) - 1.0])
 
@@ -30,27 +30,27 @@ def open_onnx(path: Path) -> onnxruntime.InferenceSession:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's errors have no class in common
+    except Exception as error:  # onnxruntime raises errors without a common class
         raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
 
 
 class Network:
-    """A policy.onnx: observation -> actions; it keeps the hidden state of a recurrent policy."""
+    """The network in policy.onnx: observation -> actions. The hidden state of a recurrent policy is kept between calls."""
 
     def __init__(self, path: Path, contract: Contract) -> None:
         """Load the file.
 
         Raises:
-            ConfigError: the file cannot be read, has other sizes than the contract, comes from another export, or gives
-                actions that are not finite.
+            ConfigError: the file cannot be read, has other sizes than the contract, comes from another export than the
+                contract, or gives actions that are not finite.
         """
         self._session, self._states = open_onnx(path), contract.states
         contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
         wanted: dict[str, tuple[int, ...]] = {"obs": (contract.width,)}
         wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
         found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
-        if list(found.items()) != list(wanted.items()):  # sizes of the batch have names in place of numbers
-            raise ConfigError(f"{path}: takes {found}, but policy.json says {wanted}")
+        if list(found.items()) != list(wanted.items()):  # `found` lacks the batch size, because it is a name
+            raise ConfigError(f"{path}: has the inputs {found}, but policy.json says {wanted}")
         self.restart()
         for _ in range(WARM_UP):
             actions = self.run(np.zeros(contract.width, dtype=np.float32))
@@ -65,14 +65,14 @@ class Network:
         self._hidden = {name: np.zeros(shape, dtype=np.float32) for name, shape in self._states.items()}
 
     def run(self, observation: np.ndarray) -> np.ndarray:
-        """Return the actions (A,) for an observation (width,), float32 both."""
+        """Return the actions (A,) float32 for an observation (width,) float32."""
         actions, *hidden = self._session.run(None, {"obs": observation[None], **self._hidden})
         self._hidden = dict(zip(self._hidden, hidden, strict=False))
         return np.asarray(actions)[0]
 
 
 class Policy:
-    """A policy on one robot: readings and commands -> joint targets, once every `contract.control_dt`."""
+    """A policy that controls one robot. Every `contract.control_dt` it converts a reading and a command to joint targets."""
 
     def __init__(self, folder: Path) -> None:
         """Load the export in `folder`, which may also be the path of its policy.onnx.
@@ -88,24 +88,24 @@ class Policy:
         self._network = Network(path, contract)
         self._steps = [np.zeros((group.history, group.size)) for group in contract.groups]
         self.observation = np.zeros(contract.width, dtype=np.float32)
-        """(width,) observation of the last call."""
+        """(width,) observation of the last call of `act`."""
         self.restart()
 
     def restart(self) -> None:
-        """Clear the hidden state, the last action and the histories; the next observation fills the histories, as
-        the first one of an episode does in training.
+        """Clear the hidden state, the last action and the histories. The next observation then fills each history, as
+        the first observation of an episode does in training.
         """
         self._network.restart()
         self._begins = True
         self.actions = np.zeros(len(self.contract.acted))
-        """(A,) last output, within plus and minus action_clip."""
+        """(A,) last output of the network, clipped to plus and minus action_clip; NaN where the output is not finite."""
 
     def act(self, reading: Reading, command: np.ndarray) -> np.ndarray:
-        """Return the joint targets (D,) [rad] for `command`, vx, vy [m/s] and yaw rate [rad/s]. They are not finite where the
-        network's output is not.
+        """Return the joint targets (D,) [rad]. `command` (3,) is vx, vy [m/s] and yaw rate [rad/s]. Targets are NaN where the
+        network's output is not finite.
 
         Raises:
-            KeyError: a source that the policy needs is missing.
+            KeyError: the reading lacks a source that the policy needs.
         """
         contract = self.contract
         self.observation = self._observe(reading, command)
@@ -117,7 +117,7 @@ class Policy:
         return targets
 
     def _observe(self, reading: Reading, command: np.ndarray) -> np.ndarray:
-        """Return the observation (width,) float32: scaled and clipped terms, and the histories of their groups."""
+        """Return the observation (width,) float32: each group's history with the newest scaled, clipped terms at the end."""
         contract = self.contract
         values = {
             "base_ang_vel": reading.gyro,

@@ -16,21 +16,22 @@ from legged.deploy.policy import Policy
 from legged.deploy.safety import Limits, Watch, braking, clamp_targets
 
 STANDS_WITHIN = 0.6
-"""Largest deviation of a standing robot's joint from the default pose; the robot's weight causes a part of it [rad]."""
+"""Largest deviation of a joint from the default pose at which a robot counts as standing [rad]. The limit leaves room for the
+deviation that the robot's weight causes."""
 THERE = 0.05
-"""Largest deviation of a joint at which the robot counts as in the default pose and need not fold its legs [rad]."""
+"""Largest deviation of a joint from the default pose at which the robot stands up without folding its legs first [rad]."""
 FAR = 100.0
-"""Larger joint angles are invalid measurements [rad]."""
+"""Joint angle above which a measurement counts as invalid [rad]."""
 HALT_S = 1.0
-"""Time for which a walking robot gets the command zero before it stands, because stopping at 1 m/s would make it fall [s]."""
+"""Time with the command zero between walking and standing [s]. Without this time, a robot that walks at 1 m/s would fall."""
 RETURN_S = 0.3
-"""Time to reach the default pose from walking or from a pose nearby; a slower robot would tip over [s]."""
+"""Duration of the motion to the default pose from walking or from a nearby pose [s]. In a slow motion a robot tips over."""
 SETTLE_S = 1.0
 """Time for which joints are braked before the program releases the robot [s]."""
 
 
 def along(path: Sequence[np.ndarray], share: float) -> np.ndarray:
-    """Return the pose (D,) at a share of a path of poses; all its segments take the same time and start and end at rest."""
+    """Return the pose (D,) after a share of a path's time. All segments take the same time, and start and end at rest."""
     legs = len(path) - 1
     i = min(int(share * legs), legs - 1)
     part = min(1.0, share * legs - i)
@@ -52,10 +53,10 @@ class Program:
         sleep: Callable[[float], object] = time.sleep,
         tell: Callable[[str], object] = print,
     ) -> None:
-        """Check that policy and robot fit, and start idle. Standing up takes `stand_s` [s]; `tell` receives status lines.
+        """Check that the policy fits the robot. Standing up takes `stand_s` [s]; `tell` receives status lines.
 
         Raises:
-            ConfigError: policy and robot do not fit.
+            ConfigError: the policy does not fit the robot.
         """
         policy.contract.check_fits(robot.facts)
         self._policy, self._robot, self._operator = policy, robot, operator
@@ -68,7 +69,7 @@ class Program:
         self.log = Log(contract)
         self.state = State.IDLE
         self.stops: tuple[str, ...] = ()
-        """Reasons of all stops, in order."""
+        """Reasons for all stops so far, oldest first."""
         self._reading: Reading | None = None
         self._ticks = False
         """True once the robot's clock has advanced between two readings."""
@@ -77,7 +78,7 @@ class Program:
         self.walked_s = 0.0
         """Time for which the policy acted [s]."""
         self._halting_s: float | None = None
-        """Time for which the command has been zero while a walking robot halts [s]; None if it does not halt."""
+        """Time for which the command has been zero while a walking robot halts [s]; None while the robot is not halting."""
         self._asked = (np.zeros(len(contract.joint_names)),) * 3
         """Last targets and gains that were sent to the robot."""
 
@@ -132,8 +133,8 @@ class Program:
         return Event.QUIT in events
 
     def _read(self) -> None:
-        """Process and log the new readings. A reading with the same time as the previous one repeats that measurement, so
-        it keeps the earlier time of arrival. A stop request in any reading counts.
+        """Process and log the new readings. If a reading has the same time as the previous reading, the robot repeated a
+        measurement, and the earlier time of arrival is kept. A stop request in any of the readings counts.
         """
         stops = False
         for reading in self._robot.read():
@@ -174,7 +175,7 @@ class Program:
             self._enter(State(event.value), now)
 
     def _crooked(self) -> str | None:
-        """Return a message about the joint that is furthest from a standing pose; None if all are close to it."""
+        """Return a message about the joint that is furthest from the default pose; None if all are within `STANDS_WITHIN`."""
         if self._reading is None:
             return "no reading has arrived yet"
         away = np.abs(self._reading.positions - self._contract.default)
@@ -193,8 +194,8 @@ class Program:
     def _enter(self, state: State, now: float) -> None:
         self._say(f"{self.state.value} -> {state.value}", now)
         if state is State.STAND and self._reading is not None:
-            # A lying robot folds its legs first. A robot that walked already stands; the differences between targets and
-            # joint angles carry its weight, so the targets continue from their last values.
+            # A lying robot first folds its legs. A walking robot is on its feet, and its motors carry its weight only while
+            # the targets differ from the joint angles. So its targets start from their last values, not from the angles.
             damped, bent = self.state is State.DAMPING, self._contract.crouch
             first = self._reading.positions if damped else self._asked[0]
             lies = damped and np.abs(first - self._contract.default).max() > THERE
@@ -222,7 +223,7 @@ class Program:
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
         positions = contract.default
-        if reading is not None:  # the P gain is 0, but 0 times NaN is NaN
+        if reading is not None:  # a NaN angle would give a NaN torque, even with a P gain of 0
             positions = np.where(np.abs(reading.positions) < FAR, reading.positions, positions)
         return positions, nothing, nothing if self.state is State.IDLE else self._braking
 
@@ -259,7 +260,7 @@ class Program:
             self.pace.done()
 
     def _settle_blindly(self) -> None:
-        """Send braking commands after a failure, several because one may get lost. Ignore further failures."""
+        """Send several braking commands after a failure, because one command may get lost. Ignore further failures."""
         contract = self._contract
         for _ in range(int(np.ceil(SETTLE_S / contract.control_dt))):
             with suppress(Exception):

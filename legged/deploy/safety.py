@@ -9,11 +9,11 @@ from legged.deploy.interface import Reading
 from legged.deploy.policy import gravity_in
 
 SLOWEST_FALL = 0.5
-"""Speed at which braking takes the whole torque of a joint, as a share of the joint's largest speed."""
+"""Joint speed at which braking needs the joint's largest torque, as a share of the joint's largest speed."""
 AT_ONCE = 2.0
-"""Multiple of the allowed joint speed above which the robot is stopped at once."""
+"""The robot is stopped at once if a joint is faster than this multiple of its allowed speed."""
 MOST_DAMPING = 4.0
-"""Largest D gain for braking, as a multiple of the policy's D gain, because motors may be unstable far above that gain."""
+"""Largest D gain for braking, as a multiple of the policy's D gain. With a much larger gain, motors may be unstable."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Limits:
     max_age_s: float = 0.05
     """Largest age of the newest reading [s]."""
     speed_share: float = 1.2
-    """Largest joint speed, as a share of the contract's velocity limit."""
+    """Allowed joint speed, as a multiple of the contract's velocity limit."""
     fast_s: float = 0.04
-    """Time for which a joint may be faster, as when a foot hits an edge [s]."""
+    """Time for which a joint may exceed the allowed speed, for example when a foot hits an edge [s]."""
     beyond: float = 0.2
     """Largest distance of a joint beyond its position limits [rad]."""
     max_missed: int = 5
@@ -37,26 +37,27 @@ class Limits:
 
 
 class Watch:
-    """Check of readings for reasons to stop."""
+    """Check of readings and deadlines for reasons to stop the robot."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
         self._contract, self.limits = contract, limits
         self._fastest = limits.speed_share * contract.velocity_limits
         self._fast_s = np.zeros(len(self._fastest))
-        """Time for which each joint was too fast [s]. A quarter of the time since then is subtracted, down to 0."""
+        """(D,) time for which each joint was too fast [s]. At allowed speeds it falls by a quarter of the elapsed time."""
         self._seen: float | None = None
 
     def see(self, reading: Reading) -> None:
-        """Update the times for which joints are too fast; called for every reading."""
+        """Update the times for which joints were too fast. The program calls this method for every reading."""
         passed = 0.0 if self._seen is None else np.clip(reading.received - self._seen, 0.0, self.limits.max_age_s)
         self._seen = reading.received
         fast = np.abs(reading.velocities) > self._fastest
         self._fast_s = np.maximum(0.0, self._fast_s + np.where(fast, passed, -0.25 * passed))
 
     def reason(self, reading: Reading | None, now: float, missed: int) -> str | None:
-        """Return the reason to stop the robot in one line, or None if it may go on.
+        """Return the reason to stop the robot, as one line of text; None if the robot may go on.
 
-        `reading` is the newest one, `now` the time by `time.perf_counter` [s], `missed` the deadlines missed in a row.
+        `reading` is the newest reading, `now` is the time by `time.perf_counter` [s], and `missed` is the number of deadlines
+        missed in a row.
         """
         limits = self.limits
         if reading is None:
@@ -108,8 +109,8 @@ class Watch:
 
 
 def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.ndarray, contract: Contract) -> np.ndarray:
-    """Return targets (D,) [rad] that are clipped to the position limits, and then to the range in which the torque
-    kp (target - q) - kd dq stays within the torque limits. Where the two conflict, the torque limits count.
+    """Return the targets (D,) [rad], clipped first to the position limits and then to the range in which the torque
+    kp (target - q) - kd dq is within the torque limits. If the two ranges do not overlap, the torque limits take precedence.
     """
     kp, kd, most = contract.stiffness, contract.damping, contract.torque_limits
     inside = np.clip(targets, *contract.position_limits.T)
@@ -119,7 +120,7 @@ def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.nda
 
 
 def braking(contract: Contract) -> np.ndarray:
-    """Return the D gains (D,) for braking [N m s/rad]: the whole torque at half the largest speed, but at most four times the
-    policy's D gain.
+    """Return the D gains (D,) for braking [N m s/rad]. At half of a joint's largest speed, braking needs its largest torque.
+    However, a gain is at most four times the policy's D gain.
     """
     return np.minimum(contract.torque_limits / (SLOWEST_FALL * contract.velocity_limits), MOST_DAMPING * contract.damping)

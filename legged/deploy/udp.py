@@ -1,8 +1,8 @@
 """A robot that is reached by UDP, and its packets. The robot is a simulator in another process, or a bridge to a real robot.
 
-A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program begins the handshake
-with HELLO and the sources that it needs, and the robot answers with FACTS, both as JSON. Then the robot sends states to the
-last sender of a HELLO, and the program sends commands. Each side numbers its packets in increasing order.
+A packet is `HEADER` (magic, kind, sequence number) and a body, all little-endian. The program begins the handshake with
+HELLO, whose body lists the requested sources. The robot answers with FACTS. Both bodies are JSON. Then the robot sends
+states to the last sender of a HELLO, and the program sends commands. States and commands have increasing sequence numbers.
 """
 
 import json
@@ -25,23 +25,24 @@ HEADER = struct.Struct("<4sBxxxI")
 MAGIC = b"LGD1"
 HELLO, FACTS, STATE, COMMAND, BYE = range(1, 6)
 STATE_HEAD = struct.Struct("<dHHB")
-"""Head of a state: time [s], D, flags, number of sources. Float32 w, x, y, z, gyro (3), q (D), dq (D) and torques (D) follow,
-and for each source its name (length as a byte, ASCII) and its numbers (count as uint16, float32)."""
+"""Head of a state: time [s], number D of joints, flags (0), number of sources. Then come float32 numbers:
+quaternion (4), gyro (3), joint angles (D), joint velocities (D) and torques (D). Then each source has the length of its name
+(uint8), the name (ASCII), the count of its numbers (uint16) and the numbers (float32)."""
 COMMAND_HEAD = struct.Struct("<IH")
-"""Head of a command: sequence number of the state it answers, D. Float32 targets, P gains and D gains (D each) follow."""
+"""Head of a command: sequence number of the newest state, D. Then come float32 targets (D), P gains (D) and D gains (D)."""
 LARGEST = 60_000
 """Largest size of a packet [bytes]."""
 ANSWER_S = 10.0
 """Time within which a robot must answer a HELLO [s]."""
 ASK_EVERY_S = 0.1
 SO_TIMESTAMP = getattr(socket, "SO_TIMESTAMP", 29)
-"""Linux's socket option for arrival times of packets, on the clock of `time.time`, and the type of the message with them."""
+"""Linux's socket option that adds a message with the arrival time to each packet. The message's type is the same number."""
 MOMENT = struct.Struct("@ll")
-"""Arrival time in this message: seconds and microseconds."""
+"""Arrival time in a message of SO_TIMESTAMP, by the clock of `time.time`: seconds and microseconds."""
 SET_S = 0.01
-"""Change of the difference between `perf_counter` and `time` above which the time of day counts as reset [s]."""
+"""If the difference of `time.perf_counter` and `time.time` changes by more than this, the time of day counts as reset [s]."""
 SOURCE_AGE_S = 0.2
-"""Age at which the value of a source expires [s]. This machine's clock counts, because a robot may have none."""
+"""Age at which the value of a source expires [s]. This machine's clock measures it, because a robot may have no clock."""
 
 
 def packet(kind: int, sequence: int, body: bytes = b"") -> bytes:
@@ -58,7 +59,7 @@ def open_packet(data: bytes) -> tuple[int, int, bytes] | None:
 
 
 def pack_sources(sources: Mapping[str, np.ndarray | None]) -> bytes:
-    """Return the body of a HELLO: source -> its points (P, 2), or None."""
+    """Return the body of a HELLO. `sources` has the points (P, 2) [m] of each source, or None for a source without points."""
     wanted = {name: None if points is None else points.tolist() for name, points in sources.items()}
     return json.dumps({"sources": wanted}).encode()
 
@@ -79,7 +80,7 @@ def unpack_sources(body: bytes) -> dict[str, np.ndarray | None]:
 
 
 def pack_facts(facts: RobotFacts) -> bytes:
-    """Return the body of FACTS; null stands for no limit."""
+    """Return the body of FACTS. An infinite position limit is written as null."""
     limits = [[x if np.isfinite(x) else None for x in pair] for pair in facts.position_limits.tolist()]
     said = {**vars(facts), "position_limits": limits, "offers": sorted(facts.offers)}
     return json.dumps(said, default=np.ndarray.tolist).encode()
@@ -106,7 +107,7 @@ def unpack_facts(body: bytes) -> RobotFacts:
 
 
 def pack_state(state: Reading) -> bytes:
-    """Return the body of a state; its torques must be known."""
+    """Return the body of a state. `state.torques` must not be None."""
     assert state.torques is not None
     rows = (state.quaternion, state.gyro, state.positions, state.velocities, state.torques)
     parts = [STATE_HEAD.pack(state.time, len(state.positions), 0, len(state.sources))]
@@ -139,37 +140,37 @@ def unpack_state(body: bytes, received: float) -> Reading:
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(str(error)) from error
     if place != len(body):
-        raise ValueError("its length is wrong: it is too long")
+        raise ValueError("the length of the state is larger than its head says")
     q, dq, torques = numbers[7:].reshape(3, count)
     return Reading(moment, received, numbers[:4], numbers[4:7], q, dq, torques, sources=found)
 
 
 def pack_command(answers: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> bytes:
-    """Return the body of a command."""
+    """Return the body of a command; `answers` is the sequence number of the newest state."""
     numbers = np.concatenate((positions, stiffness, damping), dtype="<f4")
     return COMMAND_HEAD.pack(answers & 0xFFFFFFFF, len(positions)) + numbers.tobytes()
 
 
 def unpack_command(body: bytes) -> tuple[int, np.ndarray]:
-    """Return the sequence number of the state that a command answers, and its targets, P gains and D gains (3, D).
+    """Return the contents of a command: the sequence number in its head, and targets, P gains and D gains (3, D).
 
     Raises:
         ValueError: the body is too short or too long, or its numbers are not finite.
     """
     if len(body) < COMMAND_HEAD.size:
-        raise ValueError("it is cut short")
+        raise ValueError("the command is shorter than its head")
     answers, count = COMMAND_HEAD.unpack_from(body)
     numbers = np.frombuffer(body, "<f4", offset=COMMAND_HEAD.size).astype(float)
     if len(numbers) != 3 * count or not np.isfinite(numbers).all():
-        raise ValueError("its numbers are too few, too many or not finite")
+        raise ValueError("the numbers of the command are too few, too many or not finite")
     return answers, numbers.reshape(3, count)
 
 
 class UdpRobot(Interface):
-    """A robot that answers with the packets of this module."""
+    """A robot that sends and receives the packets of this module."""
 
     def __init__(self, address: str) -> None:
-        """Connect to the robot at `address`, "host:port", and receive its facts.
+        """Connect to the robot at `address` ("host:port") and receive its facts.
 
         Raises:
             ConfigError: the address is invalid.
@@ -211,8 +212,8 @@ class UdpRobot(Interface):
             self._socket.send(data)
 
     def _received(self, kind: int) -> list[tuple[int, bytes, float]]:
-        """Return the new packets of a kind: their numbers, bodies and times of arrival, as `time.perf_counter` [s]. If the
-        time of day was set since the last call, the present time replaces the times of arrival.
+        """Return sequence number, body and time of arrival (by `time.perf_counter` [s]) of each new packet of a kind. If the
+        time of day was reset since the last call, the present time replaces the times of arrival.
         """
         found: list[tuple[int, bytes, float]] = []
         now, behind = time.perf_counter(), time.perf_counter() - time.time()
@@ -220,7 +221,7 @@ class UdpRobot(Interface):
         while True:
             try:
                 data, notes, _, _ = self._socket.recvmsg(LARGEST, socket.CMSG_SPACE(MOMENT.size))
-            except OSError:  # no more packets, or the last one sent had no receiver
+            except OSError:  # there are no more packets, or the last sent packet had no receiver
                 return found
             came = time.time()
             for level, name, value in notes:
@@ -250,7 +251,7 @@ class UdpRobot(Interface):
             fresh = {name: values for name, (at, values) in self._seen.items() if came - at <= SOURCE_AGE_S}
             found.append(replace(state, sources=fresh))
         if found and not self._asked <= found[-1].sources.keys():
-            self._send(self._greeting)  # the first HELLO may be lost
+            self._send(self._greeting)  # the previous HELLO may be lost
         return found
 
     def write(self, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:

@@ -1,8 +1,8 @@
-"""A Go2 or a G1 controlled by Unitree's SDK 2, on the network or in Unitree's simulator.
+"""Control of a Go2 or a G1 through Unitree's SDK 2. The robot is real, or runs in Unitree's simulator.
 
-Layouts of messages are those of the definitions (IDL) that Unitree publishes with its SDK 2, "unitree_go" for Go2 and
-"unitree_hg" for G1, in C's memory layout. The checksum is CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing
-reflected, no final exclusive or) over all but the last of the message's 32-bit words, the highest byte of each word first.
+Messages have C's memory layout of the definitions (IDL) that Unitree publishes with its SDK 2. Their package is "unitree_go"
+for Go2 and "unitree_hg" for G1. The checksum is CRC-32/MPEG-2 (polynomial 0x04C11DB7, start 0xFFFFFFFF, nothing reflected,
+no final exclusive or). It covers all 32-bit words of a message but the last, and reads each word from its highest byte.
 """
 
 import threading
@@ -24,15 +24,15 @@ SWITCHER = "unitree_sdk2py.comm.motion_switcher.motion_switcher_client"
 SIMULATOR_DOMAIN = 1
 """DDS domain of Unitree's own simulator."""
 REPEAT_S = 0.005
-"""Interval at which a command is repeated; motors and simulators expect several per control step [s]."""
+"""Interval at which the newest command is repeated [s]. Motors and simulators expect several commands per control step."""
 HOLD_S = 0.1
 """Time without a new command after which the program counts as dead and joints are braked [s]."""
 FIRST_STATE_S = 5.0
 """Time within which a robot must send its first state [s]."""
 RELEASE_S = 10.0
-"""Time within which a robot must leave its own controller [s]."""
+"""Time within which a robot must switch off its own controller [s]."""
 BRAKING = 2.0
-"""D gain of joints that are braked after the program died [N m s/rad]."""
+"""D gain with which joints are braked after `HOLD_S` without a new command [N m s/rad]."""
 FLOATS = [(name, "<f4") for name in ("q", "dq", "tau", "kp", "kd")]
 GO_MOTOR = np.dtype([("mode", "u1"), *FLOATS, ("reserve", "<u4", (3,))], align=True)
 GO_COMMAND = np.dtype(
@@ -54,7 +54,7 @@ GO_COMMAND = np.dtype(
     ],
     align=True,
 )
-"""LowCmd of unitree_go, 812 bytes."""
+"""Layout of the message LowCmd of unitree_go (812 bytes)."""
 HG_MOTOR = np.dtype([("mode", "u1"), *FLOATS, ("reserve", "<u4")], align=True)
 HG_COMMAND = np.dtype(
     [
@@ -66,19 +66,19 @@ HG_COMMAND = np.dtype(
     ],
     align=True,
 )
-"""LowCmd of unitree_hg, 1004 bytes."""
+"""Layout of the message LowCmd of unitree_hg (1004 bytes)."""
 NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0
-"""Targets for motors of Go2 without position or velocity control."""
+"""Values of `q` and `dq` that switch off position and velocity control of a Go2 motor."""
 ENABLED = 1
 """Mode of a motor that is on."""
 SERIES = 0
-"""`mode_pr` with which the ankles and the waist of G1 take pitch and roll angles instead of the angles of their motors."""
+"""Value of `mode_pr` with which targets of G1's ankles and waist are pitch and roll angles, not angles of the motors."""
 OTHER_G1 = {1: "23 joints", 3: "a locked waist", 4: "23 joints", 6: "a locked waist", 9: "no legs"}
-"""`mode_machine` of a G1 without all 29 joints -> its joints (from the table of Unitree's description of G1)."""
+"""`mode_machine` of a G1 with fewer than 29 joints -> what is different (from the table in Unitree's description of G1)."""
 BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 """Byte -> the byte with its bits in reverse order."""
 SELECT, L2, B = (2, 3), (2, 5), (3, 1)
-"""Keys of the remote control: byte of `wireless_remote` and bit in it."""
+"""Keys of the remote control: (index of a byte in `wireless_remote`, index of the key's bit in this byte)."""
 # Lowest and highest angle [rad], largest velocity [rad/s] and torque [N m] of each joint, from Unitree's models.
 _GO2_LEG = {"hip": (-1.0472, 1.0472, 30.1, 23.7), "calf": (-2.7227, -0.83776, 20.07, 35.55)}
 _GO2_THIGH = {"F": (-1.5708, 3.4907, 30.1, 23.7), "R": (-0.5236, 4.5379, 30.1, 23.7)}
@@ -108,7 +108,7 @@ _G1_ARM = {
 
 
 def _side(side: str, parts: dict[str, tuple[float, float, float, float]]) -> dict[str, tuple[float, float, float, float]]:
-    """Return the joints of one side; on the right, rolls of hips and shoulders have the opposite sign."""
+    """Return joint -> limits for one side. On the right side, the limits of hip roll and shoulder roll are mirrored."""
     mirrored = ("hip_roll", "shoulder_roll") if side == "right" else ()
     return {
         f"{side}_{part}_joint": (-high, -low, speed, torque) if part in mirrored else (low, high, speed, torque)
@@ -143,16 +143,16 @@ def _facts(name: str, imu_body: str, joints: dict[str, tuple[float, float, float
 
 
 KINDS = {
-    # The motors of Go2 are ordered front right, front left, rear right, rear left; the joints begin with the left.
+    # The leg order of Go2's motors is FR, FL, RR, RL. The leg order of the joints is FL, FR, RL, RR.
     "go2": UnitreeKind(_facts("go2", "base", _GO2), (3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8), GO_COMMAND, "unitree_go"),
     "g1": UnitreeKind(_facts("g1", "pelvis", _G1), tuple(range(29)), HG_COMMAND, "unitree_hg"),
 }
 
 
 def crc(message: bytes) -> int:
-    """Return the checksum for the last four bytes of a message.
+    """Return the checksum of a message. Its last four bytes are left out, because they will hold the checksum.
 
-    zlib computes the reflected CRC of the same polynomial, so the bits of input and output are reversed.
+    zlib computes the reflected CRC of the same polynomial, so the function reverses the bits of zlib's input and output.
     """
     words = np.frombuffer(message, "<u4")[:-1].astype(">u4").tobytes()
     reflected = zlib.crc32(words.translate(BITS)) ^ 0xFFFFFFFF
@@ -162,8 +162,9 @@ def crc(message: bytes) -> int:
 def command_of(
     kind: UnitreeKind, mode_machine: int, positions: np.ndarray, stiffness: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return a command as a NumPy record, with targets (D,) [rad] and gains (D,) [N m/rad], [N m s/rad] of the joints. Target
-    velocities and feedforward torques are zero, and all other motors are off. `mode_machine` is the value in G1's state.
+    """Return a command as a NumPy record. `positions` [rad], `stiffness` [N m/rad] and `damping` [N m s/rad] are (D,) each.
+    Target velocities and feedforward torques are zero, and motors without a joint get no torque. `mode_machine` is the value
+    in the newest state of a G1.
     """
     message, places = np.zeros((), kind.command), list(kind.motors)
     motors = message["motor_cmd"]
@@ -193,7 +194,7 @@ def copy_into(message: np.ndarray, target: Any) -> None:
 
 
 class SdkWire:
-    """Transport of messages by Unitree's SDK (the extra `unitree-sdk2`)."""
+    """Connection to a robot through Unitree's SDK, which the extra `unitree-sdk2` installs."""
 
     def __init__(self, kind: UnitreeKind, network: str | None, domain: int) -> None:
         """Join the network through the interface `network`, such as eth0. The DDS `domain` is 0 for a robot, and
@@ -206,32 +207,32 @@ class SdkWire:
             channel = import_module("unitree_sdk2py.core.channel")
             default = import_module("unitree_sdk2py.idl.default")
             messages = import_module(f"unitree_sdk2py.idl.{kind.package}.msg.dds_")
-            # A simulator has no controller to leave.
+            # Unitree's simulator has no controller that must be switched off.
             self._switcher = None if domain == SIMULATOR_DOMAIN else import_module(SWITCHER)
         except ImportError as error:
             raise ConfigError(
-                f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}): pip install"
-                " 'legged[unitree-sdk2]'; if that does not help, install it from Unitree's own sources (unitree_sdk2_python)"
+                f"--robot: Unitree's SDK cannot be imported ({' '.join(str(error).split())}); run `pip install"
+                " 'legged[unitree-sdk2]'`, or install the SDK from Unitree's own sources (unitree_sdk2_python)"
             ) from error
         try:
             channel.ChannelFactoryInitialize(domain, network)
-        except Exception as error:  # the SDK raises plain exceptions
+        except Exception as error:  # the SDK raises Exception itself
             raise ConfigError(f"--network: {network or 'none given'}: domain {domain} cannot be joined ({error})") from error
         self.new_command: Callable[[], Any] = getattr(default, f"{kind.package}_msg_dds__LowCmd_")
-        """Return a LowCmd_ of the robot's kind, with zeros."""
+        """Function that returns a LowCmd_ of the robot's kind, filled with zeros."""
         self._publisher = channel.ChannelPublisher(COMMAND_TOPIC, messages.LowCmd_)
         self._publisher.Init()
         self._subscriber = channel.ChannelSubscriber(STATE_TOPIC, messages.LowState_)
 
     def listen(self, heard: Callable[[Any], None]) -> None:
-        """Call `heard` with every LowState_ from another thread."""
+        """Call `heard` in another thread for every LowState_ that arrives."""
         self._subscriber.Init(heard, 10)
 
     def take_over(self) -> None:
-        """Make the robot leave its own controller before the first command, since two programs must never command one robot.
+        """Switch off the robot's own controller before the first command, since two programs must never command one robot.
 
         Raises:
-            RunError: the robot keeps its controller or does not answer.
+            RunError: the robot's controller stays on, or the robot does not answer.
         """
         if self._switcher is None:
             return
@@ -256,7 +257,7 @@ class SdkWire:
         Raises:
             RunError: the command was not sent.
         """
-        if self._publisher.Write(command) is False:  # the SDK returns False, it raises nothing
+        if self._publisher.Write(command) is False:  # if sending fails, the SDK raises no error
             raise RunError("--robot: Unitree's SDK could not send a command")
 
     def close(self) -> None:
@@ -266,14 +267,14 @@ class SdkWire:
 
 
 class UnitreeRobot(Interface):
-    """A Unitree robot. A thread repeats the newest command, and brakes the joints if the program dies."""
+    """A Unitree robot. A thread repeats the newest command, and brakes the joints if no new command comes for `HOLD_S`."""
 
     def __init__(self, name: str, wire: SdkWire, repeat_s: float = REPEAT_S) -> None:
-        """Wait for the first state of the robot `name`, a key of `KINDS`, and make it leave its own controller.
+        """Wait for the robot's first state, and switch off the robot's own controller. `name` is a key of `KINDS`.
 
         Raises:
-            ConfigError: the robot is a G1 without all 29 joints.
-            RunError: the robot sends no state, or keeps its controller.
+            ConfigError: the robot is a G1 with fewer than 29 joints.
+            RunError: the robot sends no state, or its own controller stays on.
         """
         self.kind = KINDS[name]
         self.facts = self.kind.facts
@@ -287,7 +288,7 @@ class UnitreeRobot(Interface):
             wire.listen(self._hear)
             if not self._first.wait(FIRST_STATE_S):
                 raise RunError(
-                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; check that the robot is on, and --network"
+                    f"--robot: {name}: no state came within {FIRST_STATE_S:g} s; check --network, and that the robot is on"
                 )
             if name == "g1" and (lacks := OTHER_G1.get(self._mode_machine)) is not None:
                 raise ConfigError(f"--robot: g1: mode_machine is {self._mode_machine}: this robot has {lacks}, not 29 joints")
@@ -303,7 +304,7 @@ class UnitreeRobot(Interface):
         self._repeater.start()
 
     def _hear(self, state: Any) -> None:
-        """Store the reading of a LowState_."""
+        """Store a LowState_ as a `Reading`."""
         received = time.perf_counter()
         motors = [state.motor_state[place] for place in self.kind.motors]
         select, l2, b = (bool(int(state.wireless_remote[byte]) >> bit & 1) for byte, bit in (SELECT, L2, B))
@@ -324,7 +325,7 @@ class UnitreeRobot(Interface):
         self._first.set()
 
     def ask(self, sources: Mapping[str, np.ndarray | None]) -> None:
-        """Do nothing: the robot offers no further observations, such as a height map. Policies that need one are refused."""
+        """Do nothing: the robot offers no sources such as a height map. Policies that need a source are refused."""
 
     def read(self) -> list[Reading]:
         with self._lock:
@@ -338,7 +339,7 @@ class UnitreeRobot(Interface):
             self._wire.send(self._command)
 
     def _repeat(self) -> None:
-        """Send the newest command until the robot is released; brake once the command is too old."""
+        """Send the newest command repeatedly until `close`. If it is older than `HOLD_S`, send a braking command instead."""
         nothing = np.zeros(len(self.kind.motors))
         while not self._closing.wait(self._repeat_s):
             with self._lock:
@@ -347,7 +348,7 @@ class UnitreeRobot(Interface):
                 if not self._braked and time.perf_counter() - self._written > HOLD_S:
                     copy_into(command_of(self.kind, self._mode_machine, nothing, nothing, nothing + BRAKING), self._command)
                     self._braked = True
-                with suppress(Exception):  # a later command may succeed; `write` raises its own errors
+                with suppress(Exception):  # the next repetition may succeed, and `write` reports failures
                     self._wire.send(self._command)
 
     def close(self) -> None:

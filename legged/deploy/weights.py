@@ -1,16 +1,18 @@
-"""policy.weights: a network as plain numbers, for computers without onnxruntime; `cpp/legged_policy.hpp` reads it too.
+"""The file policy.weights: a network as plain numbers, for computers without onnxruntime and for `cpp/legged_policy.hpp`.
 
-All numbers are little-endian. The file has `MAGIC`, the number of layers (uint32), and for each layer: kind, detail, inputs,
-outputs (uint32 each), and float32 numbers, matrices row by row:
+All numbers are little-endian. The file begins with `MAGIC` and the number of layers (uint32). Each layer has kind, detail,
+number of inputs and number of outputs (uint32 each), followed by arrays of float32 numbers, with matrices row by row:
 
-- `NORMALISE`: means and divisors (inputs each); x -> (x - mean) / divisor.
-- `LINEAR`: matrix (outputs, inputs) and bias (outputs).
-- `ACTIVATION`: no numbers; `detail` is its index in `ACTIVATIONS`.
-- `LSTM`: matrices (4 outputs, inputs) and (4 outputs, outputs) and two biases (4 outputs); gates i, f, g, o.
-- `GRU`: the same with 3 in place of 4; gates r, z, n. Both are as in torch.nn.
-- `KEEP`: no numbers; passes its inputs on and keeps them for the next `JOIN`.
-- `JOIN`: no numbers; the outputs are the kept inputs followed by its own inputs. With `KEEP` and `JOIN` a policy receives
-  the outputs of an estimator in addition to its observations.
+- `NORMALISE`: means (inputs,) and divisors (inputs,). The outputs are (x - mean) / divisor.
+- `LINEAR`: a matrix (outputs, inputs) and a bias (outputs,).
+- `ACTIVATION`: no arrays. `detail` is the index of the function in `ACTIVATIONS`.
+- `LSTM`: two matrices, (4 * outputs, inputs) and (4 * outputs, outputs), and two biases (4 * outputs,). Gates have the
+  order i, f, g, o, as in torch.nn.LSTM.
+- `GRU`: two matrices, (3 * outputs, inputs) and (3 * outputs, outputs), and two biases (3 * outputs,). Gates have the
+  order r, z, n, as in torch.nn.GRU.
+- `KEEP`: no arrays. The outputs equal the inputs, and the layer keeps the inputs for the next `JOIN`.
+- `JOIN`: no arrays. The outputs are the kept inputs followed by the layer's own inputs. With `KEEP` and `JOIN` a policy
+  receives the outputs of an estimator in addition to its observations.
 """
 
 import math
@@ -48,7 +50,7 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "swish": lambda x: x * _sigmoid(x),
     "mish": lambda x: x * np.tanh(_softplus(x)),
 }
-"""Activation functions, by rsl-rl's names."""
+"""Name in rsl-rl -> activation function. A file of weights has the index of the function in this order."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ def shapes(kind: int, inputs: int, outputs: int) -> list[tuple[int, ...]]:
 
 
 def pack(layers: list[Layer]) -> bytes:
-    """Return the file of a network."""
+    """Return the contents of the file for a network."""
     parts = [MAGIC, COUNT.pack(len(layers))]
     for layer in layers:
         parts.append(HEAD.pack(layer.kind, layer.detail, layer.inputs, layer.outputs))
@@ -91,10 +93,10 @@ def pack(layers: list[Layer]) -> bytes:
 
 
 def unpack(data: bytes) -> list[Layer]:
-    """Return the layers of a file.
+    """Return the layers in the contents of a file.
 
     Raises:
-        ValueError: the data are no such file, are too short, have numbers that are not finite, or do not form a network.
+        ValueError: the data are no policy.weights, have the wrong length or numbers that are not finite, or form no network.
     """
     if data[: len(MAGIC)] != MAGIC:
         raise ValueError("is no policy.weights of an export")
@@ -136,17 +138,17 @@ def unpack(data: bytes) -> list[Layer]:
 
 
 class NumpyNetwork:
-    """The network of a policy.weights in float64 for a batch of observations. It keeps the hidden state between calls."""
+    """A network from policy.weights, run in float64 on a batch of observations. The hidden state is kept between calls."""
 
     def __init__(self, data: bytes) -> None:
-        """Load the contents of the file. Raises the errors of `unpack`."""
+        """Load the contents of a file. Wrong contents raise the errors of `unpack`."""
         self._layers = unpack(data)
         self._functions = list(ACTIVATIONS.values())
         self._hidden: dict[int, np.ndarray] = {}
         self._cells: dict[int, np.ndarray] = {}
 
     def restart(self, begins: np.ndarray | None = None) -> None:
-        """Clear the hidden state of the rows in the mask `begins` (N,), or of all rows."""
+        """Clear the hidden state of the batch rows for which the mask `begins` (N,) is true; without a mask, of all rows."""
         for states in (self._hidden, self._cells):
             for state in states.values():
                 state[slice(None) if begins is None else begins] = 0.0
@@ -170,7 +172,7 @@ class NumpyNetwork:
         return x
 
     def _recurrent(self, place: int, layer: Layer, x: np.ndarray) -> np.ndarray:
-        """Return the new hidden state (N, outputs) of a recurrent layer."""
+        """Advance a recurrent layer by one step; return its new hidden state (N, outputs)."""
         size = (len(x), layer.outputs)
         h = self._hidden.setdefault(place, np.zeros(size))
         of_input = x @ layer.arrays[0].T + layer.arrays[2]

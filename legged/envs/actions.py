@@ -1,4 +1,4 @@
-"""Conversion of a caller's actions to a tensor, and a context in which a step records no gradients."""
+"""Conversion of a caller's actions to a tensor, and a context manager for steps without gradients."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +10,8 @@ from torch import Tensor
 
 @contextmanager
 def ordinary_tensors() -> Iterator[None]:
-    """Run the block without recording gradients, and outside inference mode even if the caller has switched that mode on. A
-    term may keep a tensor from one step to the next, and a later step could not write to a tensor made in inference mode.
+    """Run the block without gradients, and outside torch's inference mode even if the caller has switched that mode on. A
+    term may keep a tensor between steps, and a later step could not write to a tensor that was made in inference mode.
     """
     with torch.inference_mode(False), torch.no_grad():
         yield

@@ -1,8 +1,8 @@
-"""Base class of all tasks: the loop of a Markov decision process on batched physics, behind rsl-rl's interface.
+"""Base class of all tasks. It steps N environments on batched physics, and implements `VecEnv`, rsl-rl's interface.
 
-Terms are methods. The configuration names the `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that run; every
-`_metric_<name>` runs. All tensors have N rows, one for each environment, and fixed addresses, so that a step is one CUDA
-graph.
+The terms of a task (observations, rewards, terminations and metrics) are methods. The configuration names the methods
+`_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that run. All methods `_metric_<name>` run. A tensor with N rows has
+one row for each environment. Tensors keep their addresses, so that one CUDA graph can hold the whole step.
 """
 
 from abc import abstractmethod
@@ -43,10 +43,10 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     Config: ClassVar[type[TaskConfig]] = TaskConfig
     """Schema of the task's configuration."""
     QUANTITIES: ClassVar[tuple[str, ...]] = ()
-    """Names of arrays in MuJoCo's data, in addition to qpos and qvel, that terms read by `self.physics.quantity(name)`."""
+    """Names of arrays in MuJoCo's data that terms read by `self.physics.quantity(name)`. qpos and qvel need no entry."""
     OWN_HELPERS: ClassVar[tuple[str, ...]] = ()
-    """Names of methods that a subclass calls itself although another framework has a hook of that name. BaseTask never calls
-    such a hook, so a method with its name must be listed here (legged/envs/class_checks.py)."""
+    """Names of a subclass's methods that are also names of hooks in another framework, such as legged_gym. BaseTask never
+    calls such a method. If a subclass calls it itself, its name must be listed here; otherwise `check` raises an error."""
 
     def __init__(self, cfg: TaskConfig, device: torch.device | str = "cpu", graph: bool = True) -> None:
         """Build physics and terms on `device`. With `graph`, the step is captured in a CUDA graph if `device` is a GPU.
@@ -66,7 +66,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Control step [s]."""
         self.max_episode_length = round(cfg.env.episode_length_s / cfg.dt)
         """Steps of a full episode."""
-        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # each GPU draws other numbers; the terrain is the same
+        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # random numbers differ between GPUs
         self.randomization = self.make_randomization()
         self._build_physics(self.make_scene())
         self.num_actions = self.physics.ctrl.shape[1]
@@ -77,7 +77,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
         self._collect_terms()
         self.numbers.allocate()
-        # On a GPU, the step runs eagerly if the engine can't be captured. On the CPU the step is only checked.
+        # On a GPU, the step runs eagerly if the engine can't be captured. On the CPU, `_build_graph` only checks the step.
         self._build_graph(graph and (self.physics.capturable or device.type == "cpu"))
 
     @classmethod
@@ -114,8 +114,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.reset_buf = torch.zeros_like(self.terminated_buf)
         """(N,) True if the episode ended, by failure or time-out."""
         self.valid = torch.ones_like(self.terminated_buf)
-        """(N,) True for environments whose numbers are finite and in bounds: state and actions of this step, rewards and
-        observations of the previous step. All other environments are terminated and reset."""
+        """(N,) True if all numbers of an environment are finite and in bounds. The numbers are state and actions of this
+        step, and rewards and observations of the previous step. Where `valid` is False, the episode ends in a failure."""
         self.reset_qpos = torch.zeros_like(self.physics.qpos)
         """(N, nq) generalised positions at the beginning of each environment's next episode."""
         self.reset_qvel = torch.zeros_like(self.physics.qvel)
@@ -142,8 +142,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self._has_buffers = False
 
     def _init_buffers(self) -> None:
-        """Hook: allocate a subclass's own tensors and parts. The hook is called after the physics is built and before terms
-        run. Overrides must call super()._init_buffers().
+        """Hook: allocate the tensors and objects of a subclass. The hook is called after the physics is built and before any
+        term runs. Overrides must call super()._init_buffers().
         """
         self._has_buffers = True
 
@@ -152,7 +152,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         cfg = self.cfg
         self._collect_judgements()
         groups = groups_in(cfg)
-        # The terms of the largest group come first, so that this group's columns are adjacent.
+        # The terms of the largest group come first, so that their columns in `observation_terms` are adjacent.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
         self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
         self.observation_terms.errors = self.make_observation_errors()
@@ -180,7 +180,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
     # ---- one control step --------------------------------------------------------------------------------------------
 
     def _step(self) -> None:
-        """Make one control step with `_action_input`. To fit a CUDA graph, it reads nothing on the host."""
+        """Make one control step with `_action_input`. A CUDA graph captures it, so the host must not read tensors."""
         self.take_actions()
         for _ in range(self.cfg.control.decimation):
             self.apply_control()
@@ -232,8 +232,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Hook: update `physics.ctrl` before each physics step, for control laws that run faster than the policy."""
 
     def draw(self) -> None:
-        """Hook: draw the random numbers of the step, and an initial state for every environment, which is used only if the
-        environment is reset. The hook runs in parallel with other parts of the step, on another stream.
+        """Hook: draw the random numbers of the step, and an initial state for every environment. Only environments that are
+        reset use their initial states. The hook runs on another stream, in parallel with other parts of the step.
         """
         self.numbers.draw()
         self.randomization.draw()
@@ -255,7 +255,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     @concurrent
     def check_termination(self) -> None:
-        """Hook: determine which episodes end: by a term, by time, or because the physics has diverged."""
+        """Hook: determine which episodes end. An episode ends by a termination term, by time, or if it is not `valid`."""
         state = torch.cat([self.physics.qpos, self.physics.qvel, self._clipped_actions], dim=1)
         largest = torch.linalg.vector_norm(state, torch.inf, dim=1)
         torch.lt(largest, LARGEST_STATE, out=self._in_bounds)  # NaN < x is False, so NaN counts as out of bounds
@@ -264,8 +264,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
 
     def _settle_endings(self) -> None:
-        """Derive failures and time-outs from `reset_buf`, because an override of `check_termination` may write only
-        `reset_buf`, as in legged_gym. An episode that ends without a time-out has failed.
+        """Make `time_out_buf` and `terminated_buf` agree with `reset_buf`. This is necessary if an override of
+        `check_termination` writes only `reset_buf`, as in legged_gym. An episode that ends without a time-out has failed.
         """
         self.time_out_buf.logical_and_(self.reset_buf)
         torch.gt(self.reset_buf, self.time_out_buf, out=self.terminated_buf)
@@ -280,8 +280,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
             self.forget(mask)
 
     def forget(self, mask: Tensor) -> None:
-        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. `redraw` runs at the same time,
-        so this hook must not read randomised properties. `reset_idx` may read them after super().reset_idx(mask).
+        """Hook: reset the buffers of the environments of `mask` (N,), whose episodes begin. This hook must not read
+        randomised properties, because the hook `redraw` changes them at the same time. An override of `reset_idx` may read
+        them after `super().reset_idx(mask)`.
         """
         self.rewards.reset(mask)
         masked_set_(self.actions, mask, 0.0)
@@ -366,8 +367,8 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
 
     def step_in_place(self, actions: Tensor) -> None:
-        """Make one control step without copies and without the task's own graph, for callers that capture the step in a
-        larger graph. Results are in `rew_buf`, `reset_buf`, `time_out_buf` and the buffers of `observation_groups`.
+        """Make one control step without the task's own graph, for callers that capture the step in a larger graph. The step
+        returns no copies. Results are in `rew_buf`, `reset_buf`, `time_out_buf` and the buffers of `observation_groups`.
         """
         self._action_input.copy_(actions)
         self._step()
@@ -381,7 +382,7 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         return None
 
     def log_rollout(self) -> dict[str, Tensor]:
-        """Return the last rollout's figures for the log, by name in TensorBoard, as new 0-dimensional tensors."""
+        """Return the last rollout's figures for the log: name in TensorBoard -> new 0-dimensional tensor."""
         return {**self.metrics.flush(), **self.nan_guard.flush()}
 
     def reset_curricula(self) -> None:

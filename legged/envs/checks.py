@@ -19,14 +19,14 @@ FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
 policy is the best.
 """
 RETURNING = ("return", "falls", "episode_length")
-"""The same as FOLLOWING for tasks without commands."""
+"""Figures that evaluations during training report for tasks without commands."""
 MOST_IN_A_POOL = 2**31 - 1
 """Largest number of contacts, or of constraint rows, summed over all robots. Engines count them with 32-bit integers."""
 MOST_SAMPLES = 2**28
 """Largest number of samples in an iteration."""
 MOST_WEIGHTS = 2**30
-"""Largest number of weights between the hidden layers of a network. With gradients and the optimiser's moments they take 16
-GB."""
+"""Largest number of weights between the hidden layers of a network. So many weights, their gradients and the optimiser's
+moments take 16 GiB."""
 
 
 def check_task(cls: type, cfg: TaskConfig) -> None:
@@ -39,10 +39,10 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
     check_terms(cls, cfg)
     if cfg.train.algorithm.symmetry and not hasattr(cls, "MIRRORED"):
         where = cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {cls.__name__} has no left and right; false learns without mirror images")
+        raise ConfigError(f"{where}: {cls.__name__} has no mirror images (table MIRRORED); set symmetry to false")
     check_networks(cfg)
     for name in RESERVED & cls.terms("_metric_"):  # type: ignore[attr-defined]
-        raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; give it another name")
+        raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; rename the method")
     for name in cfg.terminations.failures:
         if name in cfg.terminations.time_outs:
             where = cfg.origins.where("terminations.time_outs")
@@ -85,7 +85,7 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     for path, name in asked.items():
         if name not in figures:
             where = cfg.origins.where(path)
-            raise ConfigError(f"{where}: evaluations of '{cfg.task}' find no {name!r}{suggest(name, figures, 'they find')}")
+            raise ConfigError(f"{where}: evaluations of '{cfg.task}' report no {name!r}{suggest(name, figures, 'figures')}")
     if runner.stop_at and not runner.evaluate_interval:
         where = cfg.origins.where("train.runner.stop_at")
         raise ConfigError(f"{where}: needs evaluations during training; set train.runner.evaluate_interval, such as 50")
@@ -128,7 +128,7 @@ def check_sizes(cfg: TaskConfig) -> None:
         if size > MOST_IN_A_POOL:
             raise ConfigError(
                 f"{cfg.origins.where(f'sim.{field}')}: {getattr(cfg.sim, field)} for each of {robots} robots (env.num_envs:"
-                f" {cfg.origins.of('env.num_envs')}) are {size:,}, more than {MOST_IN_A_POOL:,}"
+                f" {cfg.origins.of('env.num_envs')}) make {size:,} in total, more than {MOST_IN_A_POOL:,}"
             )
     if robots * steps > MOST_SAMPLES:
         raise ConfigError(
@@ -144,17 +144,17 @@ def check_sizes(cfg: TaskConfig) -> None:
         weights = sum(a * b for a, b in pairwise(widths))
         if weights > MOST_WEIGHTS:
             where = cfg.origins.where(f"train.policy.{field}")
-            raise ConfigError(f"{where}: these are {weights:,} weights, more than {MOST_WEIGHTS:,}")
+            raise ConfigError(f"{where}: these widths make {weights:,} weights, more than {MOST_WEIGHTS:,}")
 
 
 def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Check that every observation in `used` has a valid kind in `mirrored`, the table MIRRORED of the task's class. `task`
-    is the name of this class. Error messages begin with `where`.
+    """Check that the table `mirrored` gives a valid kind of mirroring for every observation in `used`. `mirrored` is the
+    table MIRRORED of the class `task`. Error messages begin with `where`.
 
     Raises:
-        ConfigError: an observation has no kind, or an unknown one.
+        ConfigError: an observation has no kind, or an unknown kind.
     """
-    otherwise = "train.algorithm.symmetry=false learns without mirror images"
+    otherwise = "set train.algorithm.symmetry=false to learn without mirror images"
     kinds = get_args(MirrorKind)
     for name in used:
         if name not in mirrored:

@@ -13,20 +13,20 @@ from legged.config.schema import TaskConfig
 from legged.errors import ConfigError, suggest
 from legged.process.paths import relative
 
-_OBSERVE = "write a method _obs_<name> for each part and list the names in observations.groups.actor.terms and .critic.terms"
-_STEP = "override one of the hooks that _step() calls, calling super()'s: advance, compute_reward, remember, ..."
+_OBSERVE = "write a method _obs_<name> for each observation; list <name> in observations.groups.actor.terms and .critic.terms"
+_STEP = "override a hook that _step() calls (advance, compute_reward, remember, ...), and call the parent's method in it"
 _START = (
-    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for more, override"
-    " reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
+    "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for other states,"
+    " override reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
 )
-_BUILD = "robot: in the task's YAML names the robot, terrain: describes the ground (or override make_terrain())"
+_BUILD = "the keys 'robot' and 'terrain' in the task's YAML set the robot and the ground (or override make_terrain())"
 _DRAWING = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
-_TORQUES = "control.control_type, control.stiffness and control.damping set the law; other laws go into legged/mdp/control.py"
+_TORQUES = "control.control_type, .stiffness and .damping set the control law; other laws go into legged/mdp/control.py"
 _RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
 
 HOOKS = {
     # legged_gym and its forks
-    "_parse_cfg": "the configuration is complete when __init__() gets it; numbers of your own go under custom: in the YAML",
+    "_parse_cfg": "__init__() gets the complete configuration; your own numbers go under the key 'custom' in the YAML",
     "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
     "post_physics_step": _STEP,
     "_post_physics_step_callback": _STEP,
@@ -44,7 +44,7 @@ HOOKS = {
     "_get_heights": "self.measured_heights (N, P) is current after a step; terrain.measured_points_x and _y set the points",
     "_init_height_points": "terrain.measured_points_x and terrain.measured_points_y set the points of the height scan",
     "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range set friction; all else is in the MJCF",
-    "_process_dof_props": "the MJCF has joint limits and efforts, robot.yaml velocity limits; rewards.soft_* shrink limits",
+    "_process_dof_props": "joint and effort limits are in the MJCF, velocity limits in robot.yaml; rewards.soft_* scale them",
     "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range add mass; all else is in the MJCF",
     "_create_envs": _BUILD,
     "_create_ground_plane": _BUILD,
@@ -74,14 +74,14 @@ HOOKS = {
     "_pre_physics_step": _TORQUES,
     "_apply_action": _TORQUES,
     "_get_observations": _OBSERVE,
-    "_get_rewards": "write a method _reward_<name> for each part and name its scale in rewards.scales",
+    "_get_rewards": "write a method _reward_<name> for each reward and set its scale in rewards.scales",
     "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
-    "_reset_idx": "override reset_idx(mask), with one bool per robot",
+    "_reset_idx": "override reset_idx(mask), where mask has one bool per robot",
 }
 """Hook of another framework -> hint at its replacement in this package."""
 OUTSIDE = {
-    "step": "training runs _step() as a CUDA graph, not step(); override hooks of _step(), and call super()'s in them",
-    "get_observations": "training does not call it, but reads the groups' buffers; " + _OBSERVE,
+    "step": "training runs _step() as a CUDA graph, not step(); override a hook of _step() and call the parent's hook in it",
+    "get_observations": "training does not call it, but reads the buffers of observation_groups; " + _OBSERVE,
 }
 """Method that play and evaluation call, but training does not -> hint at what to override instead."""
 
@@ -114,7 +114,7 @@ def check_overrides(cls: type) -> None:
         for name in vars(part):
             if name in helpers or not (name in OUTSIDE or (name in HOOKS and not hasattr(base, name))):
                 continue
-            vain = f"would not act: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
+            vain = f"would have no effect: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
             raise ConfigError(
                 f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
                 f" (if your own code calls it, write OWN_HELPERS = ('{name}',) in the class)"
@@ -146,8 +146,8 @@ def _check_constructor(part: type) -> None:
         inspect.signature(constructor).bind(None, None, "cpu", True)
     except TypeError as error:
         raise ConfigError(
-            f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), as tasks here do"
-            f" ({error}); it gets no arguments of Isaac Gym; allocate buffers in _init_buffers()"
+            f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), without the"
+            f" arguments of Isaac Gym ({error}); allocate buffers in _init_buffers()"
         ) from error
     except ValueError:  # the constructor has no signature
         return
@@ -158,8 +158,8 @@ KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "terminati
 
 
 def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
-    """Return the terms that a configuration names: for each the prefix of its method, its name, and the dotted path of the
-    setting that names it.
+    """Return the terms that a configuration names. Each term is given as the prefix of its method, its name, and the dotted
+    path of the setting that names the term.
     """
     named = [("_reward_", name, f"rewards.scales.{name}") for name in cfg.rewards.scales]
     for group, content in groups_in(cfg).items():
@@ -200,7 +200,7 @@ def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
     where = f"{origins.where(path)}: {cls.__name__}.{name}"
     if isinstance(found, property) or not callable(getattr(cls, name)):
         raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
-    # `signature` shows `self` only for a plain method: a static method has none, and the class of a class method is bound.
+    # The signature of a plain method begins with `self`. The signature of a static or class method has only the arguments.
     bound = isinstance(found, classmethod | staticmethod)
     parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
     needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]

@@ -14,8 +14,8 @@ Function = Callable[[], Tensor]
 class ConcurrentTerms:
     """Terms that run at the same time as `check_termination`, on several streams. On the CPU they run one after the other.
 
-    On a GPU, a term is a few short launches, which mostly wait for each other. One after the other, the rewards of a
-    quadruped take a tenth of a step. On parallel streams they add almost no time to the step.
+    On a GPU, a term launches a few short kernels, each of which waits for the kernel before. If all rewards of a quadruped
+    run on one stream, they take a tenth of a step. On parallel streams they add almost no time to the step.
     """
 
     def __init__(self, device: torch.device, streams: int, settled: Callable[[], Mapping[str, Tensor]]) -> None:
@@ -61,7 +61,7 @@ class ConcurrentTerms:
         """Return the value of a term, and check that it reads no tensor of `settled`."""
         forbidden = ForbidReads(
             self._settled(),
-            "which is written after the terms with @concurrent: remove that mark, so that the term runs after"
+            "which may be written while terms with @concurrent run; remove @concurrent from this term, so that it runs after"
             " check_termination",
         )
         with forbidden:

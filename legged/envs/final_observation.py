@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class StepWatcher(Protocol):
-    """Watcher of a task. Each step calls it after rewards are computed and before any environment is reset, pushed or given a
-    new command.
+    """Watcher of a task. Each step calls `take` after rewards are computed and before any environment is reset, pushed or
+    given a new command.
     """
 
     def take(self) -> None:
-        """Copy tensors of the task. This runs within the captured step, so the host must not read tensors, and buffers must
-        keep their addresses.
+        """Copy tensors of the task. A CUDA graph captures this method with the step, so the host must not read tensors, and
+        buffers must keep their addresses.
         """
 
 
@@ -53,8 +53,8 @@ def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
 
 
 def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
-    """Attach `watcher` to a task and return it. From now on every step calls it. All episodes and curricula are reset. With
-    `graph` the step is captured anew on a GPU, or checked on the CPU.
+    """Attach `watcher` to a task and return `watcher`. From now on every step calls `watcher.take`. All episodes and
+    curricula are reset. With `graph`, the step with the watcher is captured on a GPU, or checked on the CPU.
 
     Raises:
         TermError: the step cannot be captured.

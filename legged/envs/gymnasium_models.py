@@ -15,5 +15,5 @@ def gymnasium_model(name: str) -> Path:
     found = find_spec("gymnasium")
     folder = Path(found.origin).parent / "envs" / "mujoco" / "assets" if found and found.origin else Path()
     if not (folder / name).is_file():
-        raise ConfigError(f"the package gymnasium is missing or lacks the model {name}: pip install gymnasium")
+        raise ConfigError(f"the package gymnasium is missing or lacks the model {name}; run `pip install -U gymnasium`")
     return folder / name

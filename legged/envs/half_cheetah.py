@@ -22,7 +22,7 @@ class HalfCheetah(BaseTask):
     """Gymnasium's id of the same task, with the same observations, actions and rewards."""
     POSITION_NOISE, VELOCITY_NOISE = 0.1, 0.1
     """Noise of initial states: half width of the uniform noise on the positions of the reference pose [m, rad], and standard
-    deviation of the normal velocities [m/s, rad/s]."""
+    deviation of the Gaussian noise on the velocities [m/s, rad/s]."""
 
     def make_scene(self) -> Scene:
         """Return Gymnasium's cheetah on its floor."""

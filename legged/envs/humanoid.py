@@ -77,17 +77,17 @@ class Humanoid(BaseTask):
 
     @unit("m/s, rad/s")
     def _obs_velocity(self) -> Tensor:
-        """Generalised velocities: linear (world axes) and angular (torso's axes) of the torso, then joints [m/s, rad/s]."""
+        """Torso's linear velocity (world axes) and angular velocity (torso's axes), then joint velocities [m/s, rad/s]."""
         return self.physics.qvel
 
     @unit("kg, m")
     def _obs_inertia(self) -> Tensor:
-        """MuJoCo's cinert of each body: inertia about the centre of mass in world axes, mass times offset, mass [kg, m]."""
+        """MuJoCo's cinert of each body, world axes: inertia about the robot's centre of mass, mass * offset, mass [kg, m]."""
         return self.cinert[:, TORSO:].flatten(1)
 
     @unit("rad/s, m/s")
     def _obs_body_velocity(self) -> Tensor:
-        """MuJoCo's cvel of each body: angular and linear velocity about the centre of mass, in world axes [rad/s, m/s]."""
+        """MuJoCo's cvel of each body, world axes: angular and linear velocity at the robot's centre of mass [rad/s, m/s]."""
         return self.cvel[:, TORSO:].flatten(1)
 
     @unit("N, N m")

@@ -54,16 +54,16 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     origins = cfg.origins
     where, otherwise = (
         origins.where("train.algorithm.symmetry"),
-        "train.algorithm.symmetry=false learns without mirror images",
+        "set train.algorithm.symmetry=false to learn without mirror images",
     )
     if robot.mirror is None:
-        raise ConfigError(f"{where}: '{robot.name}' is not the same left and right (at zero joint angles); {otherwise}")
+        raise ConfigError(f"{where}: left and right of '{robot.name}' are not symmetric (at zero joint angles); {otherwise}")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
-    if uneven is not None:  # `dof_pos` and actions are relative to the default pose
+    if uneven is not None:  # the observation `dof_pos` and the actions are relative to this pose, so it must be symmetric too
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
         raise ConfigError(
-            f"{where}: the default_joint_angles of '{robot.name}' are not the same left and right ({angles}); {otherwise}"
+            f"{where}: left and right default_joint_angles of '{robot.name}' are not symmetric ({angles}); {otherwise}"
         )
     acted = acted_joints(robot, cfg.control, origins.where)
     image = mirror_of_actions(robot.mirror, acted)
@@ -76,7 +76,7 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
             if values[i] != values[partner]:
                 pair = ", ".join(f"{robot.joint_names[acted[k]]} {shown(values[k])}" for k in sorted((i, partner)))
                 place = origins.where(f"control.{field}")
-                raise ConfigError(f"{place}: is not the same left and right ({pair}); {otherwise} ({where})")
+                raise ConfigError(f"{place}: left and right joints have different values ({pair}); {otherwise} ({where})")
     used = [term for group in groups_in(cfg).values() for term in group.terms]
     check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
     for name in FIELDS:
@@ -85,14 +85,14 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     y = cfg.terrain.measured_points_y
     if sorted(y) != sorted(-value for value in y):
         points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
-        raise ConfigError(f"{where}: {points} are not the same left and right: {list(y)}")
+        raise ConfigError(f"{where}: {points} must be symmetric about 0, got {list(y)}")
 
 
 def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
     """Check that an observed, randomised property has a mirror image.
 
-    A property with a number for each body, shape or passive joint has none, because these are not paired left and right. One
-    offset for all joints has none either, because mirroring changes the sign of some joints' offsets.
+    A property with a number for each body, shape or passive joint has no mirror image, because these parts are not paired
+    left and right. One offset for all joints has no mirror image, because mirroring changes the sign of some joints' offsets.
 
     Raises:
         ConfigError: the property has no mirror image.
@@ -108,7 +108,7 @@ def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
         where = cfg.origins.where(f"domain_rand.{table}.{name}.each")
         what = f"numbers for each of the {FIELDS[name].what} have" if each else "one number for all joints has"
         raise ConfigError(
-            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; set each: {str(not each).lower()}, or"
+            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; set each to {str(not each).lower()}, or set"
             " train.algorithm.symmetry=false to learn without mirror images"
         )
 
@@ -151,8 +151,8 @@ def check_points(cfg: LeggedConfig) -> None:
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:
         raise ConfigError(
-            f"{cfg.origins.where('terrain.measured_points_x')}: makes {points:,} points with measured_points_y, more"
-            f" than {MOST_POINTS:,}"
+            f"{cfg.origins.where('terrain.measured_points_x')}: the height scan has {points:,} points"
+            f" (measured_points_x times measured_points_y), more than {MOST_POINTS:,}"
         )
 
 

@@ -1,5 +1,5 @@
-"""Names of attributes in the environment classes of legged_gym and its forks, for tasks of this package: other names of
-tensors, values that are computed when they are read, and hints for names that do not exist here.
+"""Attributes of tasks in legged_gym and its forks, which tasks of this package can read too. Some are the package's tensors
+under a second name. Others are computed at each reading. For those that do not exist here, the error gives a hint.
 
 These attributes cost nothing until they are read. If a class sets an attribute with such a name, its own value is used.
 """
@@ -20,8 +20,8 @@ IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordi
 
 
 class ReadOnly(Tensor):
-    """Tensor of an attribute that is computed when it is read. Writing to this tensor or to a view of it would have no
-    effect, so it raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
+    """Value of an attribute that is computed at each reading. Writing to this tensor or to a view would not change the task.
+    So an attempt raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
     """
 
     instead: str = ""
@@ -95,7 +95,7 @@ def _obs_scales(task: Any) -> SimpleNamespace:
 
 def _noise_scale_vec(task: Any) -> Tensor:
     errors, noisy = task.observation_terms.errors, task.cfg.observations.groups["actor"].noise
-    measured = errors.noise if errors is not None and noisy else {}  # `errors` adds the noise of these terms
+    measured = errors.noise if errors is not None and noisy else {}  # noise that `errors` adds
     return torch.cat([term.scale * measured.get(term.name, term.noise) for term in task.observation_groups["actor"].terms])
 
 
@@ -175,15 +175,17 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_dof_pos": lambda task: task.dof_pos,
     "last_last_actions": lambda task: task.last_actions,
 }
-"""Name in legged_gym -> function whose value each step stores for the next one, if a term reads the name."""
+"""Name in legged_gym -> function. If a term reads the name, each step stores the function's value for the next step."""
 
-_COUNT = "count in your own tensor: allocate it in _init_buffers() and add to it in place in advance()"
-_GYM = "there is no Isaac Gym: self.physics makes the steps, and a class overrides the hooks of _step()"
+_COUNT = "count in your own tensor: allocate it in _init_buffers(), and let the hook advance() increment it in place"
+_GYM = "there is no Isaac Gym: self.physics makes the steps; to change a step, override the hooks that _step() calls"
 _INDICES = (
-    "torch.tensor([i for i, name in enumerate(self.dof_names) if 'hip' in name], device=self.device) in _init_buffers()"
+    "compute your own indices in _init_buffers(), such as"
+    " torch.tensor([i for i, name in enumerate(self.dof_names) if 'hip' in name], device=self.device)"
 )
 _BODIES = (
-    "self.feet_pos and self.feet_vel (N, F, 3) have the feet; QUANTITIES = ('xpos', 'xquat', 'cvel') asks for all bodies"
+    "self.feet_pos and self.feet_vel (N, F, 3) hold the states of the feet; for all bodies, the class attribute"
+    " QUANTITIES = ('xpos', 'xquat', 'cvel') makes them readable by self.physics.quantity(name)"
 )
 _ANGLES = "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]"
 _HISTORY = "observations.groups.<group>.history in the YAML is the number of steps that a group holds"
@@ -206,7 +208,7 @@ ABSENT = {
     "rigid_body_states": _BODIES,
     "rigid_body_state": _BODIES,
     "rigid_body_pos": _BODIES,
-    "height_samples": "self.measured_heights (N, P) are the heights around each robot, self.terrain.height_map all of them",
+    "height_samples": "self.measured_heights (N, P) are heights around each robot; self.terrain.height_map has all heights",
     "rigid_state": _BODIES,
     "rb_states": _BODIES,
     "hip_indices": _INDICES,
@@ -236,7 +238,7 @@ ABSENT = {
     "Kd_factors": _drawn("d_gain"),
     "headless": _PICTURES,
     "debug_viz": _PICTURES,
-    "init_done": "_init_buffers() runs before the first step; all other hooks run after it",
+    "init_done": "the hooks that a step calls always find the tensors that _init_buffers() allocated",
 }
 """Name in legged_gym or its forks that does not exist here -> hint at its replacement."""
 NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
@@ -250,12 +252,12 @@ class LeggedGymNames:
     `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
     continue or end at this step [s]. `rpy` (N, 3) has roll, pitch and yaw [rad]. `friction_coeffs` is (N, 1, 1),
     `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3). `noise_scale_vec` has a number for
-    each of the actor's columns. All other names have the shapes and units of their counterparts in this package.
+    each column of the actor's observations. All other names have the shapes and units of their counterparts in this package.
     """
 
     reset_buf: Tensor
 
-    if not TYPE_CHECKING:  # so that a type checker still reports missing attributes
+    if not TYPE_CHECKING:  # type checkers do not see __getattr__, so they still report missing attributes
 
         def __getattr__(self, name: str) -> Any:
             if hasattr(type(self), name):  # a property failed; reading it again raises the original error
@@ -290,7 +292,7 @@ class LeggedGymNames:
             graph = vars(self).get("_graph")
             if graph is not None and graph.captured:
                 raise AttributeError(
-                    "is stored from step to step only if a term reads it, and no term did when the step was captured"
+                    "is stored at each step only if a term reads it; no term had read it when the step was captured"
                 )
             kept = torch.zeros_like(KEPT[name](self), memory_format=torch.contiguous_format)
             vars(self)[name] = kept
@@ -299,7 +301,7 @@ class LeggedGymNames:
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
     def remember(self) -> None:
-        """Store those values of `KEPT` that a term has read, before the task overwrites the values that it stores itself."""
+        """Store the values of `KEPT` that a term has read. After that, BaseTask overwrites `last_actions`."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
             if name == "last_last_actions":  # a new episode must not see actions of the old one

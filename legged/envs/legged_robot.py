@@ -31,7 +31,7 @@ from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
 POSES = 256
-"""Number of random initial poses that are computed at the start for a robot with closed loops."""
+"""Number of random initial poses that are computed at the start for a robot with closed kinematic loops."""
 
 
 class LeggedRobot(Terms, LeggedGymNames, BaseTask):
@@ -72,8 +72,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     # ---- construction ------------------------------------------------------------------------------------------------
 
     def make_randomization(self) -> RobotRandomization:
-        """Return the randomisation: friction and base mass, which are always drawn, and the fields of
-        `domain_rand.ranges`.
+        """Return the randomised properties: friction, base mass and the fields of `domain_rand.ranges`. Friction and base
+        mass are drawn even if their randomisation is off.
         """
         return RobotRandomization(self.cfg.domain_rand, self.num_envs, self.device)
 
@@ -89,7 +89,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         return None if cfg.mesh_type == "plane" else Terrain.build(cfg, self.cfg.env.seed)
 
     def _allocate(self) -> None:
-        """Allocate the tensors of every task, with actions for the joints that are not held."""
+        """Allocate the tensors that all tasks have. There is one action for each joint that is not held."""
         self.num_actions = len(acted_joints(self.robot, self.cfg.control))
         super()._allocate()
 
@@ -145,11 +145,12 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
         low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
         self._reset_joints = self.numbers.between(low, high, robot.num_dof)
-        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear, then angular; base frame
+        self._reset_velocity = self.numbers.between(*cfg.init_state.base_velocity, 6)  # linear and angular, in the base frame
         self._reset_yaw = self.numbers.between(*cfg.init_state.yaw, 1)
         self.reset_qpos[:, 3] = 1.0
         self._poses: Tensor | None = None
-        """(K, nq - 7) joint positions of poses with closed loops, from which resets choose; None without passive joints."""
+        """(K, nq - 7) joint positions of K poses in which the kinematic loops are closed. Each reset picks one of them. None
+        without passive joints."""
         if robot.passive is not None:
             where = cfg.origins.where("init_state.dof_pos_factor")
             poses = robot.passive.draw(robot.default_qpos, cfg.init_state.dof_pos_factor, POSES, cfg.env.seed, where)
@@ -222,7 +223,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     def draw_reset(self) -> None:
         """Draw joint angles near the default pose, and velocity and yaw of the base. A robot with passive joints gets one of
-        the poses that were computed at the start, because only in these its loops are closed.
+        the poses that were computed at the start. In these poses its kinematic loops are closed.
         """
         if self.terrain_curriculum is not None:
             self.terrain_curriculum.draw()
@@ -256,7 +257,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def reset_idx(self, mask: Tensor) -> None:
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
         super().reset_idx(mask)
-        self.control.reset(mask)  # last, because it reads default angles, which `redraw` may change
+        self.control.reset(mask)  # `control` reads angles that `redraw` may change, so its reset comes last
 
     def forget(self, mask: Tensor) -> None:
         super().forget(mask)
@@ -301,7 +302,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.disturbances.act(self.physics, mask)
 
     def ask(self) -> None:
-        """Update commands that are due, and steer towards headings."""
+        """Give robots their next commands when these are due, and steer towards headings."""
         self.command_sampler.update(self.reset_buf, self.base_quat)
 
     def remember(self) -> None:
@@ -310,7 +311,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
-        """Set fixed commands vx, vy [m/s] and yaw rate [rad/s], (N, 3) or (3,), until the next call; return the observations.
+        """Hold `commands` (N, 3) or (3,): vx, vy [m/s] and yaw rate [rad/s], until the next call. Return the observations.
         If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead.
         """
         self.command_sampler.hold(commands, heading)

@@ -14,7 +14,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 def unit(text: str) -> Callable[[Method], Method]:
     """Declare the unit of a term's values, such as "m^2/s^2"; "1" for a plain number. If columns have different units, list
-    them, separated by commas. The first unit counts when settings are rescaled for another robot (docs/scaling.md).
+    the units, separated by commas. Only the first one is used to rescale settings for another robot (docs/scaling.md).
 
     Raises:
         ConfigError: the text is not a unit.
@@ -42,11 +42,11 @@ def concurrent(method: Method) -> Method:
     end.
 
     Such a term must not read `terminated_buf`, `time_out_buf`, `reset_buf`, `valid` or `rew_buf`, which are not written yet.
-    If it does, the first step raises a TermError. Nor may it write a tensor that another term reads. Terms without the mark
-    run after `check_termination`, in the order of the configuration.
+    If it does, the first step raises a TermError. Such a term must also not write a tensor that another term reads. Terms
+    without the mark run after `check_termination`, in the order of the configuration.
 
-    BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too: they write no tensor that a term
-    with the mark reads. If a class overrides one of them without the mark, all terms run as if they had no mark.
+    BaseTask's hooks `check_termination`, `measure` and `compute_reward` have the mark too, because they write no tensor that
+    a term with the mark reads. If a class overrides one of them without the mark, all terms run as if they had no mark.
     """
     vars(getattr(method, "__func__", method))["_concurrent"] = True
     return method

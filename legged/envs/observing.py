@@ -1,4 +1,4 @@
-"""Observation groups of a task, and errors of the observations in groups with noise."""
+"""Observation groups of a task, and the simulated sensor errors of the groups with noise."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from legged.mdp.random_pool import RandomPool
 
 
 class ObservingTask:
-    """Mixin of BaseTask with its observation groups and their errors."""
+    """Mixin of BaseTask that builds the observation groups and their simulated sensor errors."""
 
     cfg: TaskConfig  # type: ignore[assignment]
     observation_terms: ObservationTerms

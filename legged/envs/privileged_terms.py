@@ -60,12 +60,12 @@ MIRROR_KINDS["push_force"] = "vectors"
 
 
 def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
-    """Return the forces that are observed, by name: those that act, and those that are only observed."""
+    """Return name -> force. Those of `domain_rand.forces` act on the robot, and all others are observed as 0."""
     return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
 
 
 def largest_of(force: ForceConfig) -> float:
-    """Return the largest absolute value of a sampled force's components [N]. Observations give forces as a share of it."""
+    """Return the largest absolute value that can be drawn for a component [N]. Observed forces are divided by this value."""
     return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
 
 
@@ -83,7 +83,7 @@ def observed(cfg: Any, name: str) -> DrawConfig | None:
 
 
 def normalised(values: Tensor, draw: DrawConfig) -> Tensor:
-    """Return `values` on a scale on which the ends of the range of `draw` are -1 and 1; 0 if the ends are equal."""
+    """Return `values` rescaled so that the range of `draw` becomes [-1, 1]; 0 if the ends of the range are equal."""
     low, high = draw.range
     if draw.distribution == "log_uniform":
         values, low, high = values.clamp(min=1e-9).log(), math.log(low), math.log(high)
@@ -94,7 +94,9 @@ def _observer(name: str, field: Field) -> Callable[[Any], Tensor]:
     def observe(self: Any) -> Tensor:
         draw = observed(self.cfg, name)
         if draw is None:
-            raise ConfigError(f"_obs_{PREFIX}{name}: domain_rand.ranges does not draw '{name}', so it can't be observed")
+            raise ConfigError(
+                f"_obs_{PREFIX}{name}: '{name}' has no range in domain_rand.ranges or observed_ranges, and can't be observed"
+            )
         drawn = self.randomization.fields.get(name)
         if drawn is None:
             each = field.each if draw.each is None else draw.each

@@ -16,7 +16,7 @@ def check_randomization(cfg: TaskConfig) -> None:
     """Check the ranges of randomised properties, before anything is built.
 
     Raises:
-        ConfigError: a property does not exist, its entry is invalid, or it does not fit the engine or the control law.
+        ConfigError: a property does not exist, has an invalid entry, or does not fit the engine or the control law.
     """
     rand, legged = cfg.domain_rand, isinstance(cfg, LeggedConfig)
     for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
@@ -27,7 +27,7 @@ def check_randomization(cfg: TaskConfig) -> None:
         for name, entry in rand.ranges.items():
             if draw_of(entry).when != "start":
                 where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
-                raise ConfigError(f"{where}: {cfg.sim.solver} can't change properties after the start; sim.solver=mujoco can")
+                raise ConfigError(f"{where}: {cfg.sim.solver} can't change properties after the start; set sim.solver=mujoco")
     if isinstance(cfg, LeggedConfig) and cfg.control.laws == {"T"}:
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:
@@ -79,8 +79,8 @@ def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Cal
         raise ConfigError(f"{where(f'{path}.grow')}: the range can't widen if the property is drawn only at the start")
     if draw.grow[1] and field.derived:
         raise ConfigError(
-            f"{where(f'{path}.grow')}: the range can't widen: MuJoCo derives constants from the property, so all values that"
-            " robots choose from are drawn at the start"
+            f"{where(f'{path}.grow')}: the range can't widen: MuJoCo derives constants from the property, so the values of"
+            " all later draws are fixed at the start"
         )
 
 
@@ -162,10 +162,10 @@ def check_observed(cfg: TaskConfig) -> None:
             draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
             if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
                 low, high = draw.range
-                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # the mirror image could leave [-1, 1]
+                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # the mirrored observation could be outside [-1, 1]
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not the same on both sides of"
-                        " 0, so it has no mirror image; train.algorithm.symmetry=false needs none"
+                        f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not symmetric about 0, so"
+                        " the term has no mirror image; set a symmetric range or train.algorithm.symmetry=false"
                     )
             if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
                 raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
@@ -173,6 +173,6 @@ def check_observed(cfg: TaskConfig) -> None:
                 aside = [force.body for force in observed_forces(cfg).values() if force.body]
                 if aside:
                     raise ConfigError(
-                        f"{cfg.origins.where(path)}: push_force: a force on '{aside[0]}' has no mirror image, only forces on"
-                        " the base have one; train.algorithm.symmetry=false needs none"
+                        f"{cfg.origins.where(path)}: push_force: a force on '{aside[0]}' has no mirror image, because only"
+                        " forces on the base have one; remove the term or set train.algorithm.symmetry=false"
                     )

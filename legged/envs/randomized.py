@@ -53,7 +53,7 @@ class RandomizedTask:
         for name, draw in self.randomization.draws.items():
             if draw.each and self.field_rows[name] < 2:
                 path = where(f"domain_rand.ranges.{name}.each")
-                raise ConfigError(f"{path}: a robot has only one value of this property; remove the setting each")
+                raise ConfigError(f"{path}: a robot has only one value of this property; remove the setting `each`")
         self.randomization.widen(self.field_rows)
         self.randomization.apply(self.physics)
 
@@ -63,7 +63,9 @@ class RandomizedTask:
 
     @contextmanager
     def redrawing(self, mask: Tensor) -> Iterator[None]:
-        """Run `redraw` on another stream, in parallel with the block. `mask` (N,) is True where an episode begins."""
+        """Run `redraw` on another stream, in parallel with the body of the `with` statement. `mask` (N,) is True where an
+        episode begins.
+        """
         if not self.randomization.redrawn:
             yield
             return

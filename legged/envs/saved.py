@@ -32,7 +32,9 @@ class SavedTask(RandomizedTask):
         self.randomization.load_progress(progress.get("randomization", {}))
 
     def parts(self) -> dict[str, Any]:
-        """Return the parts with tensors to save (`STATE`), by their names in saved states. A subclass adds its own parts."""
+        """Return name in saved states -> part of the task. The tensors that a part's `STATE` names are saved. A subclass adds
+        its own parts.
+        """
         return {
             "faults": self.nan_guard,
             "randomization": self.randomization,

@@ -19,11 +19,11 @@ from legged.physics import Physics
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
-"""Contact force on a terminating shape above which the episode ends, as a multiple of the contact threshold of the feet (1 N,
-or 1 % of the weight of a robot that weighs less than 100 N).
+"""The episode ends if the contact force on a terminating shape exceeds this multiple of the feet's contact threshold. The
+threshold is 1 N, or 1 % of the weight of a robot that weighs less than 100 N.
 """
 PENALISED_FORCE = 0.1
-"""Contact force on a penalised shape above which the contact is a collision, as a multiple of the same threshold."""
+"""A contact of a penalised shape is a collision if its force exceeds this multiple of the feet's contact threshold."""
 
 
 class Terms:
@@ -65,8 +65,8 @@ class Terms:
     default_dof_pos: Tensor
     """(D,) joint angles at action 0 [rad]."""
     passive_default_pos: Tensor
-    """(P,) positions of passive hinges [rad] and slides [m] at action 0. `passive_qpos_columns` and `passive_qvel_columns`
-    are their columns in qpos and qvel. Only robots with passive joints have these three tensors.
+    """(P,) positions of passive hinges [rad] and slides [m] in the default pose. `passive_qpos_columns` and
+    `passive_qvel_columns` are their columns in qpos and qvel. Only robots with passive joints have these three tensors.
     """
     passive_qpos_columns: Tensor
     passive_qvel_columns: Tensor
@@ -93,8 +93,8 @@ class Terms:
     `termination_indices` are indices of these shapes."""
     feet_indices: Tensor
     _feet_shapes: slice | Tensor
-    """Indices of the feet among the tracked shapes; evenly spaced ones as a slice, because indexing by a slice costs no
-    launch. `_terminating_shapes` are those whose contact ends an episode."""
+    """Indices of the feet among the tracked shapes. Evenly spaced indices are stored as a slice, because indexing by a slice
+    launches no kernel. `_terminating_shapes`: the same for shapes whose contact ends an episode."""
     _terminating_shapes: slice | Tensor
     penalised_indices: Tensor
     posture_joints: Tensor
@@ -159,7 +159,7 @@ class Terms:
 
     @unit("1")
     def _obs_actions(self) -> Tensor:
-        """The policy's last output within plus and minus action_clip, by joint; 0 at the start of an episode [1]."""
+        """The policy's last output, clipped to plus or minus action_clip, by joint; 0 at the start of an episode [1]."""
         return self.actions
 
     @unit("m")
@@ -257,7 +257,7 @@ class Terms:
 
     @unit("1")
     def _reward_termination(self) -> Tensor:
-        """Failure: 1 if the episode ends in a failure. It is added after the clip at zero."""
+        """Failure: 1 if the episode ends in a failure. It is added after the sum of all other rewards is clipped at zero."""
         return self.terminated_buf.float()
 
     @concurrent
@@ -356,8 +356,8 @@ class Terms:
     @concurrent
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
-        """Sum of squared distances from the default angles, for joints that do not swing a leg forward: hips that spread or
-        turn, waist, arms, but no wheels [rad^2].
+        """Sum of squared distances from the default angles, for joints that neither swing a leg forward nor turn a wheel,
+        such as hips that spread or turn, waist and arms [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 
@@ -387,7 +387,7 @@ class Terms:
 
     @concurrent
     def _terminate_left_terrain(self) -> Tensor:
-        """Base beyond the middle of the level border around all tiles. Walking cannot be judged there."""
+        """Base less than 1 m from the end of the map, or beyond it. The map includes the flat border around all tiles."""
         assert self.terrain is not None
         x, y = self.terrain.reach
         return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)

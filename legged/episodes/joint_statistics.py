@@ -19,11 +19,11 @@ NAME = "joint_statistics"
 PANEL_INCHES = 3.6, 1.45
 """Width and height of a panel of the figure [inches]."""
 SETTLE_S = 1.0
-"""Time at the start of an episode that is left out, because the robot drops onto its feet then [s]."""
+"""Duration left out at the start of every episode, while the robot drops onto its feet [s]."""
 PHASES = 50
-"""Number of points over the phase of a gait cycle."""
+"""Number of evenly spaced points in a gait cycle."""
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 0.1, 2.0
-"""Limits of a gait cycle's length [s]. A shorter one is a bounce of the foot, and a longer one contains a stop."""
+"""Limits of a gait cycle's length [s]. A shorter cycle is a bounce of the foot, and a longer cycle contains a stop."""
 UNUSUAL = 0.5
 """Largest relative deviation of a cycle's length from the median. Cycles that deviate more, as in stumbles, are left out."""
 MEASURED = (("joint_pos", "angle"), ("joint_vel", "velocity"), ("torque", "torque"))
@@ -38,19 +38,19 @@ class JointStatistics:
     units: dict[str, list[str]]
     mean: dict[str, np.ndarray]
     std: dict[str, np.ndarray]
-    """`units`, `mean` and `std` map names of recorded arrays to (D,) values. Steps of all episodes count alike."""
+    """`units`, `mean` and `std` map names of recorded arrays to (D,) values. Every step has the same weight."""
     episodes: int
     """Number of episodes longer than `SETTLE_S`."""
     steps: int
     lost: int
     """Number of steps that are left out because they hold numbers that are not finite."""
     cycles: dict[str, np.ndarray]
-    """Name of a recorded array -> (C, PHASES, D) values over the phase of C cycles, from one touch-down to the next."""
+    """Name of a recorded array -> (C, PHASES, D) values at `PHASES` points of each of C gait cycles."""
     cycle_s: np.ndarray
     """(C,) length of each cycle [s]."""
     duty: dict[str, float]
-    """Foot -> share of the cycles' steps at whose end the foot has contact, like the duty factor of an evaluation. Cycles are
-    delimited by touch-downs of the first foot. (In the array `feet_contact`, each contact lasts a step longer.)
+    """Foot -> duty factor: share of the cycles' steps that end with the foot in contact. Contact is judged by the force at
+    the end of the step, as in `legged evaluate`. (In the array `feet_contact`, each contact lasts a step longer.)
     """
 
     def over_cycle(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -61,9 +61,9 @@ class JointStatistics:
 def joint_statistics(episodes: Episodes) -> JointStatistics:
     """Compute the statistics of some episodes.
 
-    A cycle lasts from a touch-down of the first foot to its next one, within the limits `SHORTEST_CYCLE_S`, `LONGEST_CYCLE_S`
-    and `UNUSUAL`. Its values are interpolated linearly at `PHASES` points. Steps with numbers that are not finite are left
-    out, and so are the cycles with these steps.
+    A cycle lasts from one touch-down of the first foot to the next. Its length is limited by `SHORTEST_CYCLE_S`,
+    `LONGEST_CYCLE_S` and `UNUSUAL`, and its values are interpolated linearly at `PHASES` points. Steps with numbers that are
+    not finite are left out, and so are the cycles with these steps.
 
     Raises:
         ConfigError: the task has no joints with motors, or no episode is long enough.
@@ -143,7 +143,7 @@ def write_statistics(folder: Path, found: Mapping[str, JointStatistics]) -> None
 
 
 def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
-    """Return title -> table. Each quantity has a table with a line for each joint, which gives the mean and the standard
+    """Return title -> table. Each quantity has a table with a row for each joint. The columns are the mean and the standard
     deviation of each policy and, for two policies, the difference of the means. The last table describes gait cycles, if any.
 
     Raises:

@@ -33,8 +33,8 @@ WIDTH, HEIGHT = 640, 360
 FPS, MOST_PICTURES = 25.0, 400
 """Pictures per second, and the largest number of pictures of an episode. Long episodes have fewer pictures per second."""
 FILL, GLIDE = 0.5, 0.3
-"""Share of the picture's size that the robot fills, and share of the distance to the robot by which the camera moves in each
-picture."""
+"""The robot fills the share `FILL` of the picture's width or height. In each picture, the point that the camera looks at
+moves by the share `GLIDE` of its distance to the robot."""
 QUALITIES = (80, 70, 60, 50, 40, 30, 20, 15, 10)
 """JPEG qualities. The first one with which all pictures of an episode fit into BUDGET_MB is taken."""
 BUDGET_MB = 3.0
@@ -71,7 +71,7 @@ def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, 
     sums = np.nan_to_num(episodes.of(number)["reward_parts"]).sum(axis=0, dtype=np.float64)
     names, series = episodes.columns("reward_parts"), {}
     returns = [(f"return of {names[i]}", f"{sums[i]:.2f}") for i in np.argsort(-np.abs(sums), kind="stable")]
-    for name, array in panels.arrays.items():  # (T,) or (T, K) is written as little-endian 32-bit floats in base64
+    for name, array in panels.arrays.items():  # each array is written as little-endian 32-bit floats in base64
         rows = array.reshape(len(array), -1)
         values = base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii")
         series[name] = {"values": values, "columns": rows.shape[1]}
@@ -97,7 +97,7 @@ def write_page(folder: Path, episodes: Episodes, figures: Figures, number: int, 
 
 
 class Projector:
-    """Renderer of recorded episodes. The task of the episodes is built once, with one robot in the C engine."""
+    """Renderer of recorded episodes. The task of the episodes is built once, with one robot in C MuJoCo."""
 
     def __init__(self, episodes: Episodes, cfg: TaskConfig) -> None:
         """Build the task of the configuration `cfg` on the ground of the episodes.
@@ -119,8 +119,9 @@ class Projector:
                 raise ConfigError(f"{cfg.task}: its model has changed since the recording: {name} now has {width} numbers")
 
     def show(self, number: int) -> dict[str, Any]:
-        """Return the film of an episode for its page: `pictures` as JPEG in base64, one for `every` steps. If nothing can
-        be rendered, return the reason `why`, the `parents` of B bodies, and their `places` (T', B, 3), world frame [m].
+        """Return the film of an episode for its page. `pictures` are JPEGs in base64, and `every` is the number of steps from
+        one picture to the next. If nothing can be rendered, the film has the reason `why` instead of `pictures`, and for a
+        stick figure the `parents` and the `places` (T', B, 3) of B bodies, world frame [m].
         """
         steps = int(self.episodes.lengths[number])
         every = max(1, round(1.0 / (FPS * self.episodes.dt)), -(-steps // MOST_PICTURES))
@@ -260,7 +261,7 @@ class Panels:
         return [_line(labels[i], series, i, COLORS[k % len(COLORS)]) for k, i in enumerate(chosen)]
 
     def _undriven(self, array: str, series: str, title: str, unit: str, first: int = 0) -> list[dict[str, Any]]:
-        """Return plots of the coordinates without a motor from column `first` on. Each plot has at most MOST_LINES lines."""
+        """Return plots of the columns of `array` without a motor, from `first` on. Each plot has at most MOST_LINES lines."""
         names, driven = self.episodes.columns(array), {joint[array] for joint in self.joints}
         columns = [i for i in range(first, len(names)) if i not in driven]
         if columns:
@@ -302,7 +303,7 @@ class Panels:
 
 def groups_of(names: Sequence[str]) -> list[tuple[str, list[int]]]:
     """Return (common name, indices of the joints) for each group of joints whose names differ only in the words for a leg. A
-    joint without partners is a group of its own, and so is every joint of a group with more than `MOST_LINES`.
+    joint without partners is a group of its own, and so is every joint of a group of more than `MOST_LINES` joints.
     """
     found: dict[str, list[int]] = {}
     for i, name in enumerate(names):

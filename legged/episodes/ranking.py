@@ -76,7 +76,7 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None) -> list[int
     """Return the numbers of the episodes, the worst first. With `ended_by`, only episodes that this term ended are listed.
 
     Raises:
-        ConfigError: the task lacks that figure or that term.
+        ConfigError: the episodes have no figure `by`, or no term `ended_by` can end them.
     """
     there = [FELL, *figures.values]
     if by not in there:

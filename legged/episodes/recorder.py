@@ -130,7 +130,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
     elif isinstance(cfg, LeggedConfig):
-        # The override of the episode length is left out: episodes are as long as in the training.
+        # The override of the episode length is left out, so that episodes are as long as in the training.
         own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
         if playground is not None:
             own += [*SETTING, *playground.changes(cfg)]
@@ -313,9 +313,9 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
     """Return a mapping for each joint with a motor, in the order of the motors, to be written as JSON. The list is empty if a
     motor drives something other than one joint.
 
-    The keys are `name`; `unit`, that of the position (rad, or m for a slide); `qpos` and `qvel`, the columns in the
-    generalised coordinates; `range`, the lowest and the highest position; `max_velocity`; and `max_torque`, the largest
-    nominal torque [N m], or force [N] of a slide, in either direction. A limit is None if the joint does not have it.
+    `unit` is the unit of the joint's position: rad, or m for a slide. `qpos` and `qvel` are the joint's columns in the
+    generalised positions and velocities. `range` has the lowest and the highest position. `max_torque` is the largest nominal
+    torque [N m], or force [N] of a slide, in either direction. A limit is None if the joint does not have it.
     """
     model = task.physics.model
     if isinstance(task, LeggedRobot):

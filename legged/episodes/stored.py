@@ -30,10 +30,11 @@ DAMAGES = (OSError, ValueError, RecursionError, zipfile.BadZipFile, EOFError, Ke
 FORMAT = 1
 """Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
-"""Arrays with a row for each episode. `episode_start` is its first row in the other arrays; one more entry is their number of
-rows. `robot` is the one that ran the episode. `failed` and `timed_out` flag an end by a failure, and by time or a term that
-is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before the first
-step. The other arrays have a row for each control step, one episode after another.
+"""Arrays with a row for each episode. All other arrays have a row for each control step, one episode after another.
+`episode_start` is the row of an episode's first step in those arrays; its extra last entry is their number of rows. `robot`
+is the index of the robot. `failed` is True if the episode ended in a failure, `timed_out` if it ended by time or by a term
+that is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before the
+first step.
 """
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 JOINTS = ("joint_pos", "joint_vel", "torque")
@@ -103,7 +104,7 @@ class Episodes:
         return list(self.about["arrays"][name]["columns"])
 
     def ended(self, number: int) -> list[str]:
-        """Return the names of the terms that ended an episode, TIME_UP, or NO_NUMBERS if physics blew up."""
+        """Return the terms that ended an episode. If no term did, return NO_NUMBERS if physics blew up, else TIME_UP."""
         terms = self.about["terminations"]
         found = [term for term, mine in zip(terms, self.arrays["ended_by"][number], strict=True) if mine]
         return found or [NO_NUMBERS if self.arrays["failed"][number] else TIME_UP]
@@ -116,7 +117,7 @@ def joint_unit(array: str, of_position: str) -> str:
 
 
 def save_episodes(episodes: Episodes, cfg: TaskConfig, folder: Path) -> None:
-    """Write arrays, description and configuration into `folder`; the arrays also hold `time` [s] and `episode`. An earlier
+    """Write arrays, description and configuration into `folder`. The arrays of `clock_of` are added. An earlier
     recording is replaced, and files that were made from it are removed.
 
     Raises:
@@ -151,7 +152,7 @@ def load_episodes(folder: Path, where: str) -> Episodes:
     """
     for name in (ARRAYS, ABOUT):
         if not (folder / name).is_file():
-            raise ConfigError(f"{where}: {relative(folder)} holds no {name}; legged episodes record writes it")
+            raise ConfigError(f"{where}: {relative(folder)} holds no {name}; the command `legged episodes record` writes it")
     try:
         about = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
         with np.load(folder / ARRAYS, allow_pickle=False) as file:
@@ -176,8 +177,8 @@ def load_config(folder: Path, where: str) -> TaskConfig:
 
 
 def check_stored(about: Any, arrays: dict[str, np.ndarray], where: str) -> None:
-    """Check the contents of episodes.json, and that shapes and names of the arrays in episodes.npz fit them. `where` names
-    the folder.
+    """Check the contents of episodes.json, and check that the arrays in episodes.npz have the described names and shapes.
+    `where` names the folder.
 
     Raises:
         ConfigError: something is missing, has another type, or does not fit the rest.

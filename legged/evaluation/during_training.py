@@ -25,12 +25,12 @@ from legged.registry import make_task, task_class
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""
 SETTLE_S = 1.0
-"""Time from the start of a command to the start of the measurement, or a third of the command's time if that is less [s]."""
+"""The measurement starts this long after the command, but at the latest after a third of the command's duration [s]."""
 
 
 def few_commands(cfg: LeggedConfig) -> Grid:
-    """Return the grid of commands for `train.runner.evaluate_envs` robots. If the configured grid has more commands than
-    robots, every second value of its longest axis is left out, repeatedly.
+    """Return the grid of commands for `train.runner.evaluate_envs` robots. As long as the grid has more commands than
+    robots, every second value of its longest axis is left out.
 
     Raises:
         ConfigError: an axis of the configuration is not a range.
@@ -93,7 +93,7 @@ class TrainingEvaluation:
         self._sums = torch.zeros(4, task.num_envs, device=device)
         self._return, self._length, self._lin, self._ang = self._sums
         self._measured = torch.zeros((), device=device)
-        """() 1 while errors are measured, 0 at the start of a command."""
+        """0-dimensional: 1 while errors are measured, 0 while robots settle."""
         self._zero = torch.zeros((), device=device)
         if self._grid is not None:
             cells = torch.tensor(self._grid.cells, dtype=torch.float32, device=device)
@@ -151,7 +151,7 @@ class TrainingEvaluation:
         return dict(zip(found, numbers, strict=True))
 
     def _found(self, measured: int) -> dict[str, Tensor]:
-        """Return name of a figure -> 0-dimensional value, from each robot's sums. Errors are sums over `measured` steps."""
+        """Return name of a figure -> 0-dimensional value, from each robot's sums. Sums of errors cover `measured` steps."""
         own = {name.removeprefix("Metrics/"): value for name, value in self.task.metrics.flush().items()}
         found = {
             "return": self._return.mean() / unit_of(self.task),

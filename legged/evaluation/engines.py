@@ -7,7 +7,7 @@ from legged.config.schema import NewtonSolver
 
 
 class Engine(NamedTuple):
-    """An engine, or Newton with one of its solvers: name in tables, and overrides that select this engine and solver."""
+    """An engine, or Newton with one solver. `label` is its name in tables, and `overrides` select it in a configuration."""
 
     label: str
     overrides: Sequence[tuple[str, Any]] = ()

@@ -1,4 +1,4 @@
-"""Evaluation of tasks without commands over full episodes, in an engine of this package or in Gymnasium's environment."""
+"""Evaluation of tasks without commands. It runs full episodes, in an engine of this package or in a Gymnasium environment."""
 
 import io
 import json
@@ -47,13 +47,14 @@ def evaluate_episodes(setting: Setting, episodes: int) -> int:
 
 
 def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
-    """Export the policy into the folder of the result. Run the exported TorchScript in Gymnasium's environment for `episodes`
-    episodes with the seeds 0, 1, ... Print a table, write evaluation_gymnasium.json, and return the exit code.
+    """Export the policy into the folder of the result. Run the exported TorchScript in the Gymnasium environment GYMNASIUM_ID
+    of the task's class, for `episodes` episodes with the seeds 0, 1, ... Print a table, write evaluation_gymnasium.json, and
+    return the exit code.
 
     Raises:
-        ConfigError: the task's class has no GYMNASIUM_ID, Gymnasium has no environment of that name, or the environment has
-            other observations or actions than the policy.
-        RunError: the policy reads more than one observation, or a file can't be written.
+        ConfigError: the task's class has no GYMNASIUM_ID, Gymnasium has no environment with this ID, or the shapes of
+            observations or actions differ between the environment and the policy.
+        RunError: the policy's input is a history of observations, or a file can't be written.
     """
     start = time.perf_counter()
     setting = replace(setting, device=torch.device("cpu"))
@@ -81,12 +82,12 @@ def _report(result: dict[str, Any], folder: Path) -> None:
 
 @torch.inference_mode()
 def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
-    """Run policy.pt from the folder `exported` in Gymnasium's environment `name`. Return the same figures as
-    `measure_episodes`, but with Gymnasium's rewards; `terms` are the parts of the reward in the `info` of each step.
+    """Run policy.pt, which is in the folder `exported`, in the Gymnasium environment `name`. Return the figures of
+    `measure_episodes`, except `contact_overflows`. Rewards are Gymnasium's; `terms` come from the `info` of each step.
 
     Raises:
         ConfigError: Gymnasium has no environment `name`, or its observations or actions do not fit the policy.
-        RunError: the policy reads more than one observation.
+        RunError: the policy's input is a history of observations.
     """
     import gymnasium
 
@@ -103,9 +104,9 @@ def run_exported(exported: Path, name: str, episodes: int) -> dict[str, Any]:
     shapes = environment.observation_space.shape, environment.action_space.shape
     own = scale.shape, middle.shape
     if shapes != own:
-        raise ConfigError(f"evaluate gymnasium: {name} has observations and actions of shapes {shapes}, the policy of {own}")
+        raise ConfigError(f"evaluate gymnasium: shapes of observations and actions differ: {name} {shapes}, policy {own}")
     if history != 1:
-        raise RunError(f"evaluate gymnasium: the policy wants the last {history} observations, {name} gives one")
+        raise RunError(f"evaluate gymnasium: the policy wants the last {history} observations, but {name} gives only one")
     returns, lengths, failures = [], [], 0
     terms: dict[str, float] = defaultdict(float)
     low, high = environment.action_space.low, environment.action_space.high  # type: ignore[attr-defined]

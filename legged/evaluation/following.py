@@ -1,5 +1,5 @@
-"""Evaluations of legged robots that follow commands: tracking and success on terrain, tracking in all engines, and tracking
-of all checkpoints of a run.
+"""Evaluations of legged robots that follow commands. They measure tracking of commands and success on terrain, compare
+tracking in all engines, and compare the tracking of all checkpoints of a run.
 """
 
 import time
@@ -37,9 +37,10 @@ WALKING_FALLS = 0.01
 def evaluate_following(
     setting: Setting, grid: Grid | None, sizes: Mapping[str, Sequence[float]] | None = None, robots: int = 0
 ) -> int:
-    """Measure tracking on the `grid`, if given, and success on terrain with `robots` robots for each of the `sizes` of each
-    terrain type, if given. Print tables, write evaluation_<physics>.json and .png and success_<physics>.png, and return the
-    exit code. If only one of the two is measured, the file keeps its older values of the other for the same checkpoint.
+    """Measure tracking on the commands of `grid`, unless it is None. Measure success on terrain, unless `sizes` (terrain type
+    -> sizes) is empty, with `robots` robots for each size. Print tables, write evaluation_<physics>.json and .png and
+    success_<physics>.png, and return the exit code. If tracking or success is not measured, the JSON file keeps its older
+    values if they are for the same checkpoint.
 
     Raises:
         RunError: a file can't be written.
@@ -59,7 +60,7 @@ def evaluate_following(
     if tracking:
         print_tracking(shown)
         warn_of_overflows("tracking", shown["contact_overflows"])
-        tracking.pop("contact_overflows", None)  # results on a plane do not hold it
+        tracking.pop("contact_overflows", None)  # the file holds this count only for rough ground
     if success is not None:
         print_success(success)
         warn_of_overflows("success", success["contact_overflows"])
@@ -134,7 +135,7 @@ def _measured(setting: Setting, grid: Grid) -> dict[str, Any]:
 
 
 def crossing_table(result: dict[str, Any]) -> Table:
-    """Return a table with one line for each engine. If every robot fell before it was measured, the errors are "none"."""
+    """Return a table with one line for each engine. If all robots fell before the measurement, the errors are "none"."""
     cells = len(result["grid"]["vx"]) * len(result["grid"]["vy"]) * len(result["grid"]["yaw"])
     title = f"{result['task']} ({result['checkpoint']}): {cells} commands x {result['robots_per_cell']} robots"
     forms = {"rmse_lin": "{:.3f} m/s", "rmse_ang": "{:.3f} rad/s", "falls": "{:.1f} %"}
@@ -175,8 +176,8 @@ def draw_crossing(result: dict[str, Any], path: Path) -> None:
 
 
 def evaluate_all_checkpoints(setting: Setting, grid: Grid, rmse: float = WALKING_RMSE, falls: float = WALKING_FALLS) -> int:
-    """Measure every checkpoint in the policy's folder on the grid, print a line for each, and name the first that walks. A
-    policy walks if its mean velocity RMSE is below `rmse` [m/s] and its share of falls is below `falls`. Write
+    """Measure on the grid all checkpoints in the policy's folder. Print a line for each checkpoint, and which one walks
+    first. A policy walks if its mean velocity RMSE is below `rmse` [m/s] and its share of falls is below `falls`. Write
     time_to_walk.json; return the exit code.
 
     The time of a checkpoint is the wall time [s] from the start of the training process, before its imports, until the

@@ -36,9 +36,10 @@ def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:
 
 
 def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
-    """Return the equally weighted mean of `shares`, each (successes, trials), and the interval of the mean. The interval adds
-    the squared distances from each share to the ends of its Wilson interval (G. Y. Zou and A. Donner, Statistics in Medicine
-    27, 2008). So the interval has a width above 0 even if all shares are 0 or 100 %.
+    """Return the equally weighted mean of `shares`, each (successes, trials), and the interval of the mean. The lower half
+    of this interval is the root of the summed squares of the shares' distances to the lower ends of their Wilson intervals,
+    divided by the number of shares. The upper half uses the upper ends (G. Y. Zou and A. Donner, Statistics in Medicine 27,
+    2008). The interval has a width above 0 even if all shares are 0 or 100 %.
     """
     found = [(n / of, *wilson(n, of)) for n, of in shares]
     mean = sum(share for share, _, _ in found) / len(found)
@@ -47,8 +48,8 @@ def mean_of_shares(shares: Sequence[tuple[int, int]]) -> tuple[float, Interval]:
 
 
 def normal_mean(mean: float, std: float, count: int) -> Interval | None:
-    """Return the interval of the `mean` of `count` values with the sample standard deviation `std`, from the normal
-    distribution. Return None for fewer than two values.
+    """Return the interval of a mean, computed with the normal distribution. `mean` and `std` are the mean and the sample
+    standard deviation of `count` values. Return None for fewer than two values.
     """
     if count < FEWEST:
         return None

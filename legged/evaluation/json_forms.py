@@ -1,4 +1,4 @@
-"""Checks that values from JSON files, which may be damaged or foreign, have the form on which the reading code relies."""
+"""Checks of the form of values from JSON files. A file may be damaged, or another program may have written it."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,9 +6,9 @@ from typing import Any
 from legged.errors import ConfigError
 
 TEXT, NUMBER, POSITIVE, INDEX = "a text", "a number", "a number above 0", "a whole number of at least 0"
-"""Forms of single values. A number is below LARGEST in magnitude; a number above 0 is above SMALLEST."""
+"""Forms of single values. The magnitude of all numbers must be below LARGEST, and a POSITIVE number must exceed SMALLEST."""
 ANY = "*"
-"""Key in the form of a mapping that stands for all names in the mapping."""
+"""In a form that describes a mapping, this key stands for all names of the mapping."""
 LARGEST, SMALLEST = 1e30, 1e-9
 ABSENT = object()
 """Stands for the value of a name that a mapping lacks."""
@@ -25,7 +25,7 @@ def check_form(value: Any, form: Any, damaged: str, path: str = "", or_null: str
     """Check that a value has a form. `path` is the value's place in its file, for the message.
 
     `form` is one of the constants above, a set of allowed values, or an `OrNull`. A list of values is described by [form], by
-    [form, ...] if it may not be empty, or by a tuple with a form for each entry. A mapping is described by a mapping from
+    [form, ...] if it must not be empty, or by a tuple with a form for each entry. A mapping is described by a mapping from
     names to forms; a name that ends in ? may be absent. Messages add the text `or_null` to the name of the form.
 
     Raises:

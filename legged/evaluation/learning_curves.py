@@ -1,4 +1,4 @@
-"""Learning curves: scalars from the TensorBoard files of runs, and charts of them for one run or for several runs."""
+"""Learning curves: scalars from the TensorBoard files of runs, and charts of these scalars for one run or several runs."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ SAME_TIME = 0.05
 MOST_PARTS = len(COLORS) - 1
 """Largest number of parts of the reward that have their own colour. Smaller parts are summed."""
 EPISODE, LENGTH, LEVEL, WATCHED = "Episode/rew_", "Metrics/episode_length", "Terrain/level_", "Evaluation/"
-"""Prefixes of tags; `WATCHED` is the prefix of evaluations during training."""
+"""Prefixes of tags, and the tag LENGTH. Tags of evaluations during training begin with WATCHED."""
 SINGLE = ("Metrics/lin_vel_rmse", "Metrics/ang_vel_rmse", "Metrics/falls")
 CURRICULUM = ("Metrics/command_vx", "Metrics/command_vy", "Metrics/command_yaw")
 LEARNER = ("Policy/mean_std", "Loss/value", "Loss/behavior")
@@ -118,8 +118,8 @@ def always_promoted(config: dict[str, Any]) -> float | None:
 
 
 def smooth(values: np.ndarray, width: int = 9) -> np.ndarray:
-    """Return the running mean over `width` values (n,); the window is shorter at the ends. Values that are not finite are
-    left out. Where the window has no finite value, the mean is NaN.
+    """Return the running mean (n,) of `values` (n,) in a window of `width` values, which is shorter at the ends. Values that
+    are not finite are left out. Where the window has no finite value, the mean is NaN.
     """
     if not len(values):
         return values
@@ -204,7 +204,7 @@ def _tags(runs: Named, beginning: str) -> list[str]:
 
 
 def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
-    """Return a chart for each of these tags that a run logged."""
+    """Return a chart for each of the `tags` that at least one run logged."""
     names = {tag: "evaluated: " * tag.startswith(WATCHED) + tag.partition("/")[2].replace("_", " ") for tag in tags}
     titles = {tag: TITLES.get(tag, (name, 1.0)) for tag, name in names.items()}
     return [chart for tag, (title, factor) in titles.items() for chart in _one(tag, title, runs, factor, **how)]
@@ -256,8 +256,8 @@ def _parts(scalars: Scalars) -> str:
 
 
 def levels(logs: Sequence[Log]) -> list[Chart]:
-    """Return charts, with a line for each terrain type, of the level and of the shares of episodes after which a robot moves
-    up or down. Values are means over the runs. The list is empty without a terrain curriculum.
+    """Return charts of the mean terrain level, and of the shares of episodes after which a robot moves up or down. Each chart
+    has a line for each terrain type. Values are means over the runs. The list is empty without a terrain curriculum.
     """
     scalars = [log.scalars for log in logs]
     types = [tag.removeprefix(LEVEL) for tag in _tags([("", log) for log in logs], LEVEL)]

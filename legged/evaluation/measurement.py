@@ -1,4 +1,4 @@
-"""Common parts of all measurements of a policy: its setting, the first fields of a result, and the count of lost contacts."""
+"""Common parts of all measurements of a policy: the setting, the first fields of a result, and the count of lost contacts."""
 
 import sys
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ class Setting:
     device: torch.device
     folder: Path
     overrides: Sequence[tuple[str, Any]] = ()
-    """Overrides of the command line."""
+    """Overrides that the user gave on the command line."""
     graph: bool = True
     """True: on a GPU, steps run as CUDA graphs. False: steps run eagerly."""
     where: str = "sim.physics"
@@ -33,7 +33,7 @@ class Setting:
 
     @property
     def asked(self) -> list[tuple[str, Any]]:
-        """The `overrides`, after an override that selects the device's default engine instead of the training's engine."""
+        """An override that selects the device's default engine, not that of the training, followed by the `overrides`."""
         return [("sim.physics", resolve_physics("auto", self.device)), *self.overrides]
 
     @cached_property
@@ -58,14 +58,14 @@ class Setting:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """{"changes": mapping from field to value} of the overrides that change the conditions; empty if none does."""
+        """{"changes": {field: value, ...}} for overrides that change the conditions of the measurement. Without them: {}."""
         changes = changes_of(self.overrides)
         return {"changes": changes} if changes else {}
 
 
 class Overflows:
-    """Counts in how many control steps contacts were lost, summed over robots. It adds up the task's own counts, which the
-    task resets whenever it logs them.
+    """Number of control steps in which contacts were lost, summed over robots. A task resets its own count at each logging.
+    Therefore this class adds up the logged counts.
     """
 
     NAME = "Metrics/contact_overflows"
@@ -84,7 +84,7 @@ class Overflows:
 
 
 def warn_of_overflows(what: str, lost: int) -> None:
-    """Print a warning if contacts were lost `lost` times in the measurement `what`."""
+    """Print a warning if contacts were lost in the measurement `what`. `lost` is the number of losses (robots x steps)."""
     if lost:
         said = f"contacts were lost {lost} times (robots x steps), because memory was full; raise sim.nconmax and sim.njmax"
         print(f"warning: {what}: {said}", file=sys.stderr)

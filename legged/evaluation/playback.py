@@ -74,11 +74,12 @@ class Stage:
 def play(
     robot: Robot, policy: ForeignPolicy, commands: Sequence[Sequence[float]], seconds: float, friction: float
 ) -> list[dict[str, Any]]:
-    """Play every command for `seconds`, from the default pose on the ground. `friction` is that of robot and ground.
+    """Let the robot follow each command for `seconds`, each time from the default pose on the ground. `friction` is the
+    friction coefficient between robot and ground.
 
-    Return a mapping for each command. `velocity` is the mean after SETTLING_S in the base frame [m/s, m/s, rad/s] and
-    `lowest_base` the smallest height of the base after SETTLING_S [m]; both are None if the robot fell. `fell_after` is the
-    time of the fall [s], or None. `command` is the command.
+    Return a mapping for each command, with the command under `command`. `velocity` is the mean velocity after SETTLING_S,
+    base frame [m/s, m/s, rad/s]. `lowest_base` is the smallest height of the base after SETTLING_S [m]. Both are None if the
+    robot fell. `fell_after` is the time of the fall [s], or None without a fall.
     """
     stage, rows = Stage(robot, policy, friction), []
     for command in commands:
@@ -93,9 +94,9 @@ def play(
 
 
 def follow(robot: Robot, policy: ForeignPolicy, grid: Grid, friction: float) -> dict[str, Any]:
-    """Measure the errors on the commands of the grid, with one robot for each. The errors of horizontal velocity [m/s] and
-    yaw rate [rad/s] are root mean squares over the control steps from `grid.settle_s` to a fall or the end. Return mean and
-    worst cell of both errors, the share of falls, and "cells", which has both errors and `fell` for each command.
+    """Measure how well the robot follows each command of the grid. The errors of horizontal velocity [m/s] and yaw rate
+    [rad/s] are root mean squares over the control steps from `grid.settle_s` to a fall or the end. Return the mean and the
+    worst cell of each error, the share of falls, and "cells", which has both errors and `fell` for each command.
     """
     stage, cells, rows = Stage(robot, policy, friction), grid.cells, []
     for command in cells:

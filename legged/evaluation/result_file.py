@@ -1,4 +1,4 @@
-"""Files with the results of evaluations. A file is checked when it is read, because it may be damaged or foreign."""
+"""Files with the results of evaluations. A file is checked when it is read, because it may be damaged or of another kind."""
 
 import json
 import math
@@ -70,7 +70,7 @@ def kept_parts(path: Path, head: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Read the results at `paths`, which are files and folders. Each file is read once.
+    """Read the results at `paths`, which are files or folders. A file that is found twice counts once.
 
     Raises:
         ConfigError: a path does not exist or holds no evaluation.
@@ -79,7 +79,7 @@ def read_results(paths: Iterable[Path]) -> list[dict[str, Any]]:
     for path in paths:
         files = sorted(path.glob(file_name("*"))) if path.is_dir() else [path]
         if not files or not all(file.is_file() for file in files):
-            raise ConfigError(f"{path}: holds no evaluation_<physics>.json; legged evaluate writes it")
+            raise ConfigError(f"{path}: holds no evaluation_<physics>.json; the command `legged evaluate` writes it")
         for file in files:
             try:
                 result = json.loads(file.read_text(encoding="utf-8"))
@@ -97,7 +97,7 @@ def check_result(result: Any, where: str) -> None:
         ConfigError: a field is missing or has a wrong type.
     """
     damaged, there = f"{where}: is not the result of an evaluation", result if isinstance(result, dict) else {}
-    alone = "success" in there and not TRACKING.keys() & there.keys()  # from `legged evaluate terrain`
+    alone = "success" in there and not TRACKING.keys() & there.keys()  # `legged evaluate terrain` writes success alone
     tracking: dict[str, Any] = {"rough": TRACKING} if "rough" in there else {} if alone else TRACKING
     check_form(result, {**HEAD, "episodes": EPISODES} if "episodes" in there else {**HEAD, **SUCCESS, **tracking}, damaged)
 
@@ -123,7 +123,7 @@ def tracking_of(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def falls_of(tracking: dict[str, Any]) -> tuple[int, int] | None:
-    """Return how many robots fell on the grid of commands, and how many there were; None if the result lacks a number."""
+    """Return how many robots fell on the grid of commands, and how many robots there were; None if numbers are missing."""
     try:
         robots = len(tracking["cells"]) * int(tracking["robots_per_cell"])
         return (round(tracking["falls"] * robots), robots) if robots > 0 else None

@@ -1,8 +1,8 @@
-"""Success over difficulty, measured, printed and drawn: the share of robots that walk out of tiles of each terrain type.
+"""Measure, print and draw success over difficulty: the share of robots that walk out of the tiles of each terrain type.
 
 Sizes and commands are those of Rudin et al. (arXiv 2109.11978), Fig. 5; the largest sizes are harder than those of training.
 Robots start in the middle of a tile and keep their heading, with commands of 0.75 m/s forward and up to 0.1 m/s sideways.
-`Scores` defines success. The numbers in this file are for a robot half a metre high. For other robots lengths are multiplied
+`Scores` defines success. The numbers in this file are for a robot half a metre high. For other robots, lengths are multiplied
 by `terrain.scale` and velocities by its square root (constant Froude number).
 """
 
@@ -41,7 +41,7 @@ from legged.terrain import METRES, TERRAIN_TYPES, hardest_difficulty, terrain_ty
 TILE = 8.0
 """Side of a tile [m]."""
 DISTANCE = 4.0
-"""Distance from the start at which a robot succeeds [m]: half a tile."""
+"""Distance from its start that a robot must reach to succeed [m]: half a tile."""
 TIME_S = 20.0
 """Time limit for DISTANCE [s]."""
 FORWARD, SIDEWAYS = 0.75, 0.1
@@ -69,7 +69,7 @@ FEWER: dict[str, tuple[float, ...]] = {
     **dict.fromkeys(("rough_slope_up", "rough_slope_down"), (10.0, 20.0, 25.0)),
     **dict.fromkeys(OF_STEPS, (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)),
 }
-"""Terrain type -> sizes that are measured without `--full`, in the type's unit. Other types have those of SIZES."""
+"""Terrain type -> sizes that are measured without `--full`, in the type's unit. Types without an entry use SIZES."""
 SMALLEST = 0.001
 """Smallest size that a user can choose, in the type's unit."""
 MOST_SIZES = 100
@@ -92,8 +92,8 @@ PANELS = {
 
 
 class Scores:
-    """Outcomes of N robots. The first event of a robot decides: it is far enough from its start (REACHED), the task ends its
-    episode as a failure (FELL), or its time is up, after TIME_S or by a time-out of the task (STUCK).
+    """Outcomes of N robots. A robot's first event decides: the robot is far enough from its start (REACHED), the task ends
+    its episode as a failure (FELL), or time is up (STUCK). Time is up after TIME_S or at a time-out of the task.
     """
 
     def __init__(self, start: Tensor, distance: float = DISTANCE) -> None:
@@ -127,7 +127,7 @@ class Scores:
 
 
 def sizes_of(name: str, full: bool, scale: float = 1.0) -> tuple[float, ...]:
-    """Return the sizes of a terrain type, ascending, in its unit; `full` as in `--full`. `scale` is `terrain.scale`."""
+    """Return a terrain type's sizes in its unit, in ascending order. `full` means `--full`, `scale` is `terrain.scale`."""
     kind = TERRAIN_TYPES[name]
     found = SIZES.get(name) if full else FEWER.get(name, SIZES.get(name))
     # A type without a list is measured at the sizes of these difficulties; 1.2 is harder than training, which ends at 1.
@@ -193,8 +193,8 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
-    """Measure success on one terrain type, with `robots` robots for each of the `sizes`. The task's terrain is that of
-    `tiles_of_sizes`. Return the figures of each size, and the number of times that a robot lost contacts in a step.
+    """Measure success on one terrain type, with `robots` robots for each of the `sizes`. The task's terrain comes
+    from `tiles_of_sizes`. Return the figures of each size, and how often full memory made a robot lose contacts in a step.
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -203,8 +203,8 @@ def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robo
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
-    """Let all robots walk out of their tiles, with `robots` robots for each size. Return their scores, and the number of
-    times that a robot lost contacts in a step.
+    """Let all robots walk out of their tiles, with `robots` robots for each size. Return their scores, and how often
+    full memory made a robot lose contacts in a step.
     """
     place(task, robots)
     task.reset()
@@ -280,7 +280,7 @@ def _on_type(
     """Build the task for one terrain type and measure success. The task can be freed after the call."""
     cfg: Any = override(setting.policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
-    gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not have the memory for two tasks
+    gc.collect()  # the previous task is in a reference cycle, and a GPU may not have the memory for two tasks
     task, act = restore(setting.policy, changes, setting.device, setting.graph, terrain)
     return measure_success(task, act, sizes, robots)
 
@@ -310,17 +310,17 @@ def print_success(success: dict[str, Any]) -> None:
 
 
 def is_beyond(name: str, size: float, trained_to: float | None) -> bool:
-    """Return whether a size is harder than `trained_to`, the hardest of the training; False if `trained_to` is None."""
+    """Return whether a size is harder than `trained_to`, the training's hardest size. A `trained_to` of None gives False."""
     if trained_to is None:
         return False
     kind = TERRAIN_TYPES[name]
-    grows = kind.size(1.0) >= kind.size(0.0)  # false for stepping stones: smaller ones are harder
+    grows = kind.size(1.0) >= kind.size(0.0)  # small stepping stones are harder than large ones
     return size > trained_to + 1e-9 if grows else size < trained_to - 1e-9
 
 
 def with_other_engines(result: dict[str, Any], path: Path) -> list[dict[str, Any]]:
-    """Return `result`, and results in other engines from files (evaluation_<physics>.json) in the folder of `path`. Only
-    results of the same checkpoint and with the same changed fields are returned.
+    """Return `result` and the results of other engines, which are read from evaluation_<physics>.json in the folder of
+    `path`. Results of another checkpoint or with other changed fields are left out.
     """
     found = [result]
     drawn = {"types": {ANY: {**TYPE, "points": [{**POINT, "low": NUMBER, "high": NUMBER}]}}, "robots_per_point": NUMBER}
@@ -371,8 +371,8 @@ def success_line(label: str, entry: dict[str, Any]) -> Line:
 
 
 def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
-    """Return the chart of success over size. `lines` pairs a terrain type's entry in a result with its line. A dotted line
-    marks the hardest size of the training. If lines differ in that size, the names of the lines label the dotted lines.
+    """Return the chart of success over size. `lines` holds pairs: the entry of a terrain type in a result, and its curve. A
+    dotted line marks the hardest size of the training. If there are several such sizes, the dotted lines name their curves.
     """
     ends: dict[float, list[str]] = {}
     for entry, line in lines:

@@ -1,4 +1,4 @@
-"""Terrain for measurements, which replaces the terrain of the training."""
+"""Terrain on which policies are measured, instead of the terrain of the training."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -14,7 +14,7 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 BORDER = 3.0
 """Width of the level ground around the outer tiles [m]."""
 ROUGH_SPAWN = 2.0
-"""Largest distance of a robot's start from the middle of rough ground, in x and in y [m]. Robots start on different bumps."""
+"""Largest distance of a start from the middle of rough ground, in x and y [m]. It lets robots start on different bumps."""
 ROUGH_ROOM = 1.5
 """Margin of rough ground beyond the farthest point that a command leads to [m]."""
 VARIANTS = 16
@@ -24,9 +24,9 @@ because a single tile may have an easy way out.
 
 
 def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple[str, Any]]:
-    """Return overrides for a task on tiles with sides of `side` [m], which the caller builds. Observations do not change.
+    """Return overrides for a task on tiles with sides of `side` [m]. The caller builds the tiles. Observations do not change.
 
-    The overrides themselves describe one level tile, which is small enough for the check of the terrain's size.
+    The overrides describe only one level tile, which is small enough for the check of the terrain's size.
     """
     return [
         ("terrain.mesh_type", "height_map"),
@@ -43,12 +43,14 @@ def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple
 
 
 def dividing_cell(length: float, cell: float) -> float:
-    """Return the largest edge of a cell, at most `cell` [m], of which `length` [m] is a multiple."""
+    """Return the largest cell edge [m] that is at most `cell` [m] and divides `length` [m] into whole cells."""
     return length / ceil(length / cell - 1e-6)
 
 
 def cell_for(name: str, cfg: TerrainConfig) -> float:
-    """Return the edge of a terrain type's height-map cells [m]: the training's, or less so that features are whole cells."""
+    """Return the edge of the height-map cells for a terrain type [m]. It is that of the training, or a smaller one if
+    features of the type must be whole cells.
+    """
     kind = TERRAIN_TYPES[name]
     if not kind.exact or kind.finest is None:
         return cfg.horizontal_scale
@@ -61,7 +63,7 @@ def rough_ground(cfg: TerrainConfig, seed: int) -> Terrain:
 
 
 def rough_side(grid: Grid) -> float:
-    """Return the side of a tile that robots do not leave while they follow the commands [m]: 20 m for 1.4 m/s and 4 s."""
+    """Return the side [m] of a tile that robots do not leave while they follow the commands: 20 m for 4 s at 1.4 m/s."""
     fastest = float(np.linalg.norm(grid.cells[:, :2], axis=1).max())
     return 2.0 * ceil(ROUGH_SPAWN + fastest * grid.hold_s + ROUGH_ROOM)
 

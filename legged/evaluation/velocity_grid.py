@@ -70,7 +70,7 @@ def axis_values(flag: str, text: str) -> list[float]:
     """
     given = low, high, _ = read_range(flag, text, f"{flag}=-1:1:0.5")
     if max(abs(low), abs(high)) > FASTEST:
-        raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g}; commands are in m/s and rad/s")
+        raise ConfigError(f"{flag}: '{text}' asks for more than {FASTEST:g} m/s or rad/s, the largest command")
     return spaced(flag, text, given)
 
 
@@ -102,9 +102,7 @@ def axes_of(cfg: LeggedConfig) -> dict[str, list[float]]:
     return {axis: spaced(f"evaluation.{axis}", str(list(values)), values) for axis, values in given.items()}
 
 
-def spaced(
-    where: str, text: str, given: Sequence[float], what: str = "cells of this axis alone", most: int = MOST_VALUES
-) -> list[float]:
+def spaced(where: str, text: str, given: Sequence[float], what: str = "values", most: int = MOST_VALUES) -> list[float]:
     """Return the values of the range `given` (low, high, step). `where`, `text` and `what` are words for error messages.
 
     Raises:
@@ -134,7 +132,9 @@ def check_size(grid: Grid) -> None:
 
 
 def mean_and_worst(values: np.ndarray, cells: np.ndarray) -> dict[str, Any]:
-    """Return mean, worst value and worst cell of `values` (C,) over `cells` (C, 3). NaN is left out; None if all are NaN."""
+    """Return the mean, the worst value and the worst cell of `values` (C,) over `cells` (C, 3). NaN values are left out. If
+    all values are NaN, the three results are None.
+    """
     if np.isnan(values).all():
         return {"mean": None, "worst": None, "worst_cell": None}
     worst = int(np.nanargmax(values))

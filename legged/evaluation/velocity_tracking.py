@@ -1,4 +1,4 @@
-"""Velocity tracking: errors of a policy over a grid of constant commands, measured, printed and drawn."""
+"""Measure, print and draw the tracking errors of a policy over a grid of constant velocity commands."""
 
 import math
 import warnings
@@ -39,7 +39,7 @@ GAIT = (
 )
 """Figures of the gait: label in the table, name in a cell's result, factor and format."""
 PANELS = (("rmse_lin", 2, "vy", "velocity RMSE [m/s]"), ("rmse_ang", 1, "yaw", "yaw rate RMSE [rad/s]"))
-"""Heat maps: figure that is drawn, index of the command over which it is averaged, command on the vertical axis, title."""
+"""Heat maps: name of the drawn error, index of the command that is averaged out, command on the vertical axis, title."""
 
 
 def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
@@ -55,8 +55,8 @@ def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
 def place_to_track(
     cfg: LeggedConfig, grid: Grid, asked: list[tuple[str, Any]]
 ) -> tuple[list[tuple[str, Any]], Terrain | None]:
-    """Return the overrides for a task of grid.num_envs undisturbed robots, followed by `asked`; and the terrain, which is
-    level ground with bumps, or None for a task on a plane.
+    """Return the overrides and the terrain for a task of grid.num_envs undisturbed robots. The overrides end with `asked`.
+    The terrain is level ground with bumps, or None for a task on a plane.
     """
     changes = undisturbed(grid.num_envs, grid.hold_s)
     if cfg.terrain.mesh_type == "plane":
@@ -107,8 +107,8 @@ def hold(
     """Let robots follow constant commands (N, 3) for `hold_s` [s]. From `settle_s` [s] on, `read` is called with the
     observations after each control step and returns name -> quantity (N, ...).
 
-    Return three things: the sums of these quantities over each robot's first episode, where "steps" (N,) is the number of
-    summed steps; flags (N,) of the robots that fell in this episode; and how often a robot lost contacts in a step.
+    Return the sums of these quantities over each robot's first episode, flags (N,) of the robots that fell in this episode,
+    and how often full memory made a robot lose contacts in a step. The sum "steps" (N,) counts the summed steps.
     """
     task.reset()
     observations = task.hold_commands(commands)
@@ -128,7 +128,7 @@ def hold(
 
 
 def _now(task: LeggedRobot) -> dict[str, Tensor]:
-    """Return name -> quantity, (N,) or (N, feet), after a control step; these quantities are summed over steps."""
+    """Return name -> quantity, (N,) or (N, feet), after a control step. `hold` sums each quantity over steps."""
     power = task.torques * task.dof_vel
     collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
     return {
@@ -145,14 +145,14 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
 
 
 def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tensor, measured_s: float) -> dict[str, Any]:
-    """Return the figures of each cell and of the whole grid. A figure is None if every robot fell before it was measured."""
+    """Return the figures of each cell and of the whole grid. Figures without a measured robot are None."""
     cells = grid.cells
 
     def per_cell(values: Tensor) -> np.ndarray:
         return values.double().cpu().numpy().reshape(len(cells), grid.robots, *values.shape[1:])
 
     total = {name: per_cell(values).sum(axis=1) for name, values in sums.items()}
-    # If every robot of a cell fell before it was measured, its figures are NaN, because an error of 0 would look perfect.
+    # A cell whose robots all fell before the measurement has figures of NaN, because an error of 0 would look perfect.
     steps = np.where(total["steps"] > 0, total["steps"], np.nan)
     lin, ang = (np.sqrt(total[name] / steps) for name in ("lin", "ang"))
     speed = total["speed"] / steps
@@ -196,8 +196,8 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
 def estimation_errors(
     kind: type[BaseTask], names: Sequence[str], squares: Tensor, steps: Tensor
 ) -> dict[str, dict[str, Any]]:
-    """Return name of an estimated term -> `rmse`, the root mean square error over all robots and steps, and `unit`. `squares`
-    (N, terms) are sums of squared errors over the `steps` (N,) of each robot. Without a step `rmse` is None.
+    """Return name of an estimated term -> `rmse` and `unit`. `rmse` is the root mean square error over all robots and steps,
+    or None without a step. `squares` (N, terms) are sums of squared errors over the `steps` (N,) of each robot.
     """
     count = float(steps.double().sum())
     means = (squares.double().sum(dim=0) / max(count, 1.0)).tolist()
@@ -237,8 +237,8 @@ def _command(cell: list[float]) -> str:
 
 
 def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
-    """Return the mean of the figure `name` over the command with index `over`. The result has vx along its first axis and the
-    remaining command along its second. It is NaN where every robot fell before it was measured.
+    """Return the mean of the figure `name` over the command with index `over`. The first axis of the means is
+    vx, the second is the remaining command. A mean is NaN where all robots fell before the measurement.
     """
     shape = tuple(len(result["grid"][axis]) for axis in AXES)
     values = np.array([cell[name] for cell in result["cells"]], dtype=float).reshape(shape)
@@ -260,7 +260,7 @@ def draw_tracking(result: dict[str, Any], path: Path) -> None:
             axis.set_yticks(range(len(grid[other])), [f"{v:g}" for v in grid[other]])
             axis.set_xlabel(f"commanded vx [{AXES['vx']}]")
             axis.set_ylabel(f"commanded {other} [{AXES[other]}]")
-            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # values are NaN where all robots fell
+            largest = np.max(values, where=np.isfinite(values), initial=0.0)  # values are NaN where all robots fell early
             for (i, j), value in np.ndenumerate(values):
                 dark = value > 0.6 * largest
                 axis.text(i, j, f"{value:.2f}", ha="center", va="center", color="white" if dark else "black")

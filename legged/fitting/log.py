@@ -1,4 +1,4 @@
-"""Logs of actuators: .npz files of targets, positions, velocities and torques of joints, in runs without gaps."""
+"""Logs of actuators: .npz files of joint targets, positions, velocities and torques. A log has runs without gaps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ HELD_OUT = 5
 FEWEST_HELD_OUT = 0.1
 """Whole runs are held out only if these runs together have at least this share of all samples."""
 UNEVEN = 0.01
-"""Largest allowed deviation from the time step, as a share of it."""
+"""Largest allowed deviation of a sample interval from the time step, as a share of the time step."""
 SHORTEST = 200
 """Smallest number of samples of a joint."""
 
@@ -32,7 +32,7 @@ class ActuatorLog:
     joint_names: tuple[str, ...]
     dt: float
     run: np.ndarray
-    """(T,) number of each sample's run; runs have no gaps."""
+    """(T,) index of the run that a sample belongs to. Runs have no gaps."""
     target: np.ndarray
     """(T, D) target angles sent by the controller [rad]."""
     position: np.ndarray
@@ -54,8 +54,8 @@ class ActuatorLog:
 
     @property
     def held_out(self) -> np.ndarray:
-        """Return the mask (T,) of the samples that are held out from the fit, about a fifth of all. They are whole runs. If
-        there are fewer than five runs, or one run has nearly all samples, they are every fifth block of time.
+        """Return the mask (T,) of the samples that are held out from the fit, about a fifth of all. Whole runs are held
+        out, but every fifth block of time if there are fewer than five runs or one run has nearly all samples.
         """
         runs, lengths = np.unique(self.run, return_counts=True)
         if len(runs) >= HELD_OUT:
@@ -82,7 +82,7 @@ class ActuatorLog:
         return replace(self, joint_names=tuple(self.joint_names[i] for i in keep), **chosen)
 
     def resampled(self, dt: float) -> "ActuatorLog":
-        """Return the log resampled every `dt` [s]. Measurements are interpolated linearly; a target is the last one sent.
+        """Return the log resampled every `dt` [s]: measurements by linear interpolation, targets by a zero-order hold.
 
         Raises:
             ConfigError: the log's samples are further apart than `dt`.
@@ -129,7 +129,7 @@ def read_log(path: Path) -> ActuatorLog:
             arrays = {name: file[name] for name in file.files}
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or 'is not an .npz file'}") from error
-    except Exception as error:  # zipfile, numpy and zlib raise their own classes
+    except Exception as error:  # zipfile, numpy and zlib have exceptions of their own
         raise ConfigError(f"{path}: is not an .npz file of plain arrays") from error
     for name in arrays:
         if name not in NEEDED + OPTIONAL:

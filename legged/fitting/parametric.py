@@ -16,9 +16,9 @@ SEEN = 0.002
 PEAK, LIMITS = ("breakaway", "stribeck_velocity"), ("stall_torque", "no_load_speed")
 """Parameters that a fit may leave out: those of a friction peak, and those of the motor's torque-speed line."""
 MOST_SAMPLES = 40_000
-"""A search uses about this many samples at most. They are spread evenly over the log."""
+"""Approximate largest number of samples in a search. The samples are spread evenly over the log."""
 ROUGHLY = 4_000
-"""The same limit for the first searches, which try all delays."""
+"""Approximate largest number of samples in each of the first searches, which try all delays."""
 SMOOTHING = 0.1
 """Speed below which Coulomb friction fades [rad/s]."""
 WORTH = 0.005
@@ -77,8 +77,8 @@ class Drive:
 
 
 def delayed(log: ActuatorLog, samples: float) -> np.ndarray:
-    """Return the targets (T, D) of a log [rad], delayed by a number of samples and interpolated linearly. Each run has its
-    first target until the delay has passed.
+    """Return the targets (T, D) of a log [rad], delayed by a number of samples and interpolated linearly. A run's first
+    target also holds before the delay has passed.
     """
     first = np.maximum.accumulate(np.where(np.r_[True, np.diff(log.run) != 0], np.arange(len(log.run)), 0))
     whole = int(np.floor(samples))
@@ -114,7 +114,7 @@ def fit_drive(log: ActuatorLog, longest_delay: float = 0.05) -> Drive:
     tried = [search(float(k), of, of is limits, ROUGHLY) for k in delays for of in (start, limits)]
     best = min(tried, key=lambda one: one[0])[1]
     free = replace(best, stall_torque=np.inf, no_load_speed=np.inf)
-    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # limited by the torque-speed line
+    reduced = np.abs(best.predict(log)[every] - free.predict(log)[every]) > 1e-6  # the torque-speed line limits these samples
     limited = bool(np.isfinite(best.stall_torque)) and float(np.mean(reduced)) >= SEEN
     best = best if limited else free
     found = search(best.delay / log.dt, best, limited)

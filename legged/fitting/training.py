@@ -79,7 +79,7 @@ def predict(weights: NetworkWeights, log: ActuatorLog) -> np.ndarray:
 
 
 def _rows(log: ActuatorLog, past: int) -> np.ndarray:
-    """Return the indices of training samples that directly follow `past` or more other training samples of their run."""
+    """Return the indices of the training samples that follow at least `past` consecutive training samples of the same run."""
     usable = ~log.held_out
     starts = np.r_[True, (np.diff(log.run) != 0) | (np.diff(usable.astype(int)) != 0)]
     since = np.arange(len(usable)) - np.maximum.accumulate(np.where(starts, np.arange(len(usable)), 0))

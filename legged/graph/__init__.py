@@ -1,1 +1,1 @@
-"""The control step as one CUDA graph, and a guard that checks, also without a GPU, if the step can be captured."""
+"""The control step as one CUDA graph. A guard checks on any machine whether the step can be captured."""

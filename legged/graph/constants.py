@@ -22,7 +22,7 @@ class Constants:
     def __init__(self) -> None:
         self._made: dict[Any, Tensor] = {}
         self.complete = False
-        """True once all constants exist. If the step then needs a new one, its numbers change from step to step."""
+        """True once all constants exist. If a new constant is needed then, the step's numbers change from step to step."""
         self.making = False
         """True while a constant is being made."""
 
@@ -38,7 +38,7 @@ class Constants:
         if key not in self._made:
             if self.complete:
                 raise HostReadError(
-                    "makes a tensor from numbers that differ from the previous step's; a CUDA graph would repeat the old ones"
+                    "makes a tensor from numbers that differ from the previous step's; a CUDA graph repeats the old numbers"
                 )
             with self._free(), torch.inference_mode(False):  # autograd can't keep tensors made in inference mode
                 self._made[key] = make()

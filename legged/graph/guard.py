@@ -34,8 +34,8 @@ _active: "ForbidHostReads | None" = None
 
 @contextmanager
 def calling(term: str) -> Iterator[None]:
-    """Run the block as the term `term`. If the block fails, also in a capture, the error names the term. While the guard is
-    active, also check that the term leaves the Python state unchanged.
+    """Run the block as the term `term`. An error in the block names the term, also during a capture. While the guard is
+    active, check that the term leaves the Python state unchanged.
     """
     try:
         with _active.inside(term) if _active is not None else nullcontext():
@@ -48,9 +48,9 @@ def calling(term: str) -> Iterator[None]:
 
 
 class ForbidHostReads:
-    """Guard that refuses, in its block, operations that make a GPU wait for the host or that a graph can't hold: `.item()`,
-    `if tensor`, `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, random numbers of
-    the host.
+    """Guard that refuses, in its block, operations that a graph can't hold or that synchronise a GPU with the host:
+    `.item()`, `if tensor`, `nonzero`, indexing by a mask, copies to and from the host, tensors made without a device, and
+    random numbers of the host.
 
     If the same step runs several times, the guard also compares each run from the third on with the run before it. The
     attributes of `owner` other than tensors must not change. The numbers passed to torch must be the same. The step must not
@@ -106,7 +106,7 @@ class ForbidHostReads:
 
     @contextmanager
     def recording(self) -> Iterator[None]:
-        """Refuse new constants in the block, because it captures a graph and all constants exist already."""
+        """Refuse new constants in the block. The block captures a graph, and all constants exist already."""
         self.constants.complete = True
         with self._calls:
             yield
@@ -128,7 +128,7 @@ class ForbidHostReads:
             HostReadError: the text begins with `reason`.
         """
         if not self.constants.making and not caller().startswith("legged.physics"):
-            raise HostReadError(f"{reason}; a CUDA graph cannot hold that")
+            raise HostReadError(f"{reason}. A CUDA graph cannot hold this call")
 
     def _python_state(self) -> dict[str, Any]:
         return {"random": random_states(), "attributes": attributes(self.owner) if self.compares else {}}
@@ -138,7 +138,7 @@ class ForbidHostReads:
         for name, state in before["random"].items():
             if now["random"][name] != state:
                 raise HostReadError(
-                    f"draws from {name}: a CUDA graph would repeat that number for ever; draw on the device,"
+                    f"draws from {name}: a CUDA graph would repeat that number for ever; draw on the device with"
                     " torch.rand(..., device=self.device)"
                 )
         for name, state in before["attributes"].items():
@@ -186,7 +186,7 @@ class ForbidHostReads:
             name = next((f"self.{name}" for name, own in self._tensors() if memory_of(own) == memory), "")
             raise HostReadError(
                 f"reads {name or 'a tensor'}, but the previous step read another tensor there: a CUDA graph goes on reading"
-                f" the recorded one; allocate the tensor once and write in place, {name or 'tensor'}.copy_(...)"
+                f" the recorded one; allocate the tensor once and write it in place with {name or 'tensor'}.copy_(...)"
             )
 
     def _tensors(self) -> Iterator[tuple[str, Tensor]]:
@@ -235,7 +235,7 @@ class Seen:
 
 
 def memory_of(value: Any) -> int | None:
-    """Return an identifier of a tensor's memory, unique among all memory that is still referenced."""
+    """Return an identifier of a tensor's memory, or None for other values. Other referenced memory has other identifiers."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
 
 
@@ -271,13 +271,13 @@ def default_device() -> torch.device | None:
     return asked[-1] if asked else None
 
 
-UNCHECKED = "checks on the host whether it succeeded (inv, solve); torch.linalg.inv_ex and solve_ex do not"
+UNCHECKED = "checks on the host whether an operation succeeded (inv, solve); use torch.linalg.inv_ex or solve_ex"
 
-DECOMPOSED = "checks on the host whether it converged (svd, eigh and eig; pinv, cond and matrix_rank use them)"
+DECOMPOSED = "checks on the host whether svd, eigh or eig converged (also inside pinv, cond and matrix_rank)"
 
 
 class _Operators(TorchDispatchMode):
-    """Dispatch mode that sees every operator, including those that torch calls itself."""
+    """Dispatch mode that sees every operator, including those that torch calls internally."""
 
     REASONS = {
         aten._local_scalar_dense.default: "reads a value on the host (.item(), float(tensor), if tensor)",
@@ -289,12 +289,12 @@ class _Operators(TorchDispatchMode):
         aten._linalg_eigh.default: DECOMPOSED,
         aten.linalg_eig.default: DECOMPOSED,
         aten.linalg_pinv.atol_rtol_tensor: DECOMPOSED,
-        aten.linalg_matrix_exp.default: "reads the norm of its matrices on the host (matrix_exp)",
+        aten.linalg_matrix_exp.default: "reads the norm of matrices on the host (matrix_exp)",
         aten._to_sparse.default: "has a result of unknown size (to_sparse)",
-        aten.normal.Tensor_Tensor: "reads its standard deviations on the host; mean + std * torch.randn_like(mean) does not",
-        aten.normal.float_Tensor: "reads its standard deviations on the host; mean + std * torch.randn_like(std) does not",
-        aten.multinomial.default: "reads its weights on the host (multinomial)",
-        aten.nonzero.default: "has a result of unknown size (nonzero, where with one argument)",
+        aten.normal.Tensor_Tensor: "reads standard deviations on the host (normal); use mean + std * torch.randn_like(mean)",
+        aten.normal.float_Tensor: "reads standard deviations on the host (normal); use mean + std * torch.randn_like(std)",
+        aten.multinomial.default: "reads weights on the host (multinomial)",
+        aten.nonzero.default: "has a result of unknown size (nonzero, or torch.where with one argument)",
     }
 
     def __init__(self, guard: ForbidHostReads) -> None:
@@ -319,7 +319,7 @@ class _Operators(TorchDispatchMode):
                 return "indexes by a mask, so the result's size is unknown; use torch.where or masked_fill"
             return ""
         if func is aten.lift_fresh.default and args[0].dim() > 0:
-            return "makes a tensor of the host's numbers; torch.tensor(..., device=self.device) makes it on the device"
+            return "makes a tensor of the host's numbers; use torch.tensor(..., device=self.device)"
         if func in self.REASONS:
             return self.REASONS[func]
         name = str(func).split(".")[1]
@@ -358,7 +358,7 @@ class _Calls(TorchFunctionMode):
         elif func is Tensor.to and self._is_host(*args[1:], *kwargs.values()):
             guard.refuse('copies to the host (.to("cpu"))')
         elif func is Tensor.type and args[1:] and not isinstance(args[1], torch.dtype):
-            guard.refuse("copies to the host (.type with a CPU type); .to(dtype), as in .to(torch.int64), does not")
+            guard.refuse("copies to the host (.type with a CPU type); use .to(dtype), as in .to(torch.int64)")
         elif func is Tensor.new_tensor:
             return self._constant(func, args[1], args, kwargs, (args[0].dtype, args[0].device))
         elif func in _device_constructors() or func is torch.normal:

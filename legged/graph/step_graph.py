@@ -1,4 +1,4 @@
-"""The control step as one CUDA graph, with a guard that checks, on any machine, that the step can be captured."""
+"""The control step as one CUDA graph. A guard checks on any machine whether the step can be captured."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -12,7 +12,7 @@ __all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGra
 
 
 class Branch:
-    """Part of the step that runs in parallel to the rest: a second stream on a GPU, and a branch of the captured graph.
+    """Part of the step that runs in parallel to the rest of the step: on a GPU a second stream, in a CUDA graph a branch.
 
     The step's small kernels are bound by latency, so kernels in a parallel branch cost nothing. Tensors that both streams use
     must be allocated before `fork`, because one stream may reuse memory that the other still reads. Call `join` before the
@@ -72,8 +72,8 @@ class StepGraph:
         warm_up_steps: int = WARM_UP_STEPS,
         rehearse: Callable[[], None] | None = None,
     ) -> None:
-        """Check or capture `function`. With `enabled` false the function runs eagerly and unchecked. If it repeats the same
-        work many times, `rehearse` does that work once; warm-up and check call `rehearse` instead.
+        """Check `function` on the CPU, or capture it on a GPU. With `enabled` false the function runs eagerly and unchecked.
+        If the function repeats the same work many times, `rehearse` does this work once, for the warm-up and the check.
 
         Raises:
             TermError: a term of the task can't be captured.

@@ -15,7 +15,7 @@ class AsyncReadback:
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         """Start the transfer of `tensors` (name -> tensor). On a GPU this returns at once."""
         self._sizes = {name: tensor.numel() for name, tensor in tensors.items()}
-        self._numbers = torch.cat([tensor.reshape(-1) for tensor in tensors.values()])  # a copy: the tensors may change
+        self._numbers = torch.cat([tensor.reshape(-1) for tensor in tensors.values()])  # a copy, as the tensors may change
         self._arrival: torch.cuda.Event | None = None
         if self._numbers.is_cuda:
             of_device = self._numbers

@@ -126,7 +126,8 @@ class CapturedRunner(Runner):
         """Return three functions: the rollout, the update, and the update of the value function alone.
 
         They replay CUDA graphs if the task's step is captured. The third differs from the second only if training begins with
-        updates of the value function (`warms_up`). Afterwards the networks have their earlier weights, and the task is reset.
+        updates of the value function (`warms_up`). A capture needs trial steps. Afterwards the networks have their weights
+        from before the trial steps, and the task is reset.
         """
         device = torch.device(self.device)
         enabled = self.env.captured
@@ -223,7 +224,7 @@ class Clock:
     """Stopwatch for consecutive laps. On a GPU, CUDA events measure the times, so that the host need not wait."""
 
     def __init__(self, device: torch.device, before: "Clock | None" = None) -> None:
-        """Start now, or at the end of the clock `before`, so that the first lap includes the work between the two clocks."""
+        """Start now. With a clock `before`, start at its end, so the first lap includes the work between the two clocks."""
         self._cuda = device.type == "cuda"
         self._marks: list[Any] = [] if before is None else before._marks[-1:]
         if before is None:
@@ -253,7 +254,7 @@ class LaunchedIteration:
 
     iteration: int
     first: int
-    """First iteration of this training."""
+    """Number of the first iteration since training was started or resumed."""
     total: int
     """Number of iterations of the whole training, including those before it was resumed."""
     readback: AsyncReadback

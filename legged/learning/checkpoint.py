@@ -39,7 +39,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
     it runs.
 
     Raises:
-        ConfigError: the file can't be read, is not a torch file, or holds other than plain data.
+        ConfigError: the file can't be read, is not a torch file, or holds more than plain data.
     """
     name = relative(path)
     try:
@@ -50,7 +50,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
         return torch.load(path, weights_only=True, map_location=device)
     except pickle.UnpicklingError as error:
         if "weights_only" in str(error):
-            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data; that could run code)") from error
+            raise ConfigError(f"{name}: not a checkpoint (it holds more than plain data, so it could run code)") from error
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
     except Exception as error:  # torch raises half a dozen types of errors for a foreign file
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
@@ -156,11 +156,11 @@ def check_weights(state: dict[str, Any], where: str) -> None:
 
 
 def fit_optimizer(saved: Any, optimizer: torch.optim.Optimizer, where: str, waiting: int = 0) -> dict[str, Any]:
-    """Check an optimiser's state `saved` and return it. Settings other than the learning rate come from `optimizer`. If only
-    some parameters have moments, that is an error, unless exactly the first `waiting` parameters lack them.
+    """Check an optimiser's state `saved`. Return it with its own learning rates and with all other settings of `optimizer`.
+    Either all parameters must have moments, or none. As an exception, the first `waiting` parameters may all lack moments.
 
     Raises:
-        ConfigError: the state does not fit these parameters; the text begins with `where`.
+        ConfigError: the state does not fit the parameters of `optimizer`; the text begins with `where`.
     """
     groups = optimizer.state_dict()["param_groups"]
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
@@ -204,7 +204,7 @@ def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:
 
 
 def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
-    """Return network -> setting -> value for the settings of `train.policy` that decide its weights and outputs."""
+    """Return network -> setting -> value for the settings of `train.policy` that decide a network's layers and outputs."""
     policy = cfg.train.policy
     recurrent = policy.rnn_type != "none"
     shared = {
@@ -230,7 +230,7 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
 
 
 def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of one network that can be derived from its weights `state`. Old checkpoints store no settings."""
+    """Derive the settings of a network from its weights `state`, as far as possible. Old checkpoints store no settings."""
     hidden, estimator = (
         [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
         for part in ("mlp.", "estimator.")
@@ -277,8 +277,8 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
                 known = {term: width for widths in layout.values() for term, width in widths.items()}
                 size = sum(known[term] for term in wanted.terms) if set(wanted.terms) <= set(known) else "others"
                 raise ConfigError(
-                    f"{name}: made for other observations: its {group} takes {sum(layout[group].values())} numbers"
-                    f" ({', '.join(layout[group])}), '{cfg.task}' gives {size} ({', '.join(wanted.terms)})"
+                    f"{name}: made for other observations: its group {group} has {sum(layout[group].values())} numbers"
+                    f" ({', '.join(layout[group])}), but '{cfg.task}' gives {size} ({', '.join(wanted.terms)})"
                 )
             if steps.get(group, wanted.history) != wanted.history:
                 given = f"observations.groups.{group}.history {wanted.history}"
@@ -298,7 +298,9 @@ def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> Non
     robot = load_robot(cfg.robot, cfg.origins.where("robot"))
     if list(robot.joint_names) != joints:
         theirs = f"'{made_for.get('name')}' with {len(joints)} joints {joints}"
-        raise ConfigError(f"{name}: made for another robot: {theirs}, not '{robot.name}' with {robot.num_dof}")
+        raise ConfigError(
+            f"{name}: made for another robot: {theirs}; '{robot.name}' has {robot.num_dof} joints with other names or order"
+        )
 
 
 def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:

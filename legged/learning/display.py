@@ -40,9 +40,9 @@ STYLES = {
 }
 """Metrics that come first, in this order, if the task logs them."""
 ON_THE_LINE = len(STYLES)
-"""Number of metrics on a plain line. A task that lacks some of `STYLES` shows others in their place."""
+"""Number of metrics on a plain line. If a task lacks metrics of `STYLES`, other metrics of the task take their places."""
 WARNINGS = {
-    "non_finite_worlds": "{:.0f} robots reset for NaN or infinite numbers (docs/training.md)",
+    "non_finite_worlds": "{:.0f} robots reset because of NaN or infinite numbers (docs/training.md)",
     "contact_overflows": "contacts lost in {:.0f} robot steps: raise sim.nconmax, sim.njmax",
 }
 """Metric of a fault -> warning, shown if the metric is above 0."""
@@ -63,8 +63,8 @@ class Progress:
     """Mean return of the last 100 episodes."""
     action_std: float
     values: dict[str, float]
-    """Log entries of the task: rewards `rew_<term>` (per second of a full episode), `Metrics/...` and other sections. An
-    entry without a value so far is NaN."""
+    """Log entries of the task: rewards `rew_<term>` (sum over an episode, divided by the length of a full episode [s]),
+    `Metrics/...` and other sections. An entry without a value so far is NaN."""
     behavior: float | None = None
     """Mean loss between the actions of a student and of its teacher; None without a teacher."""
 
@@ -121,7 +121,7 @@ class Progress:
         return "".join(f"  estimated {plain(name)} {value:.3f}" for name, value in found)
 
     def levels(self) -> dict[str, str]:
-        """Return terrain type -> text with its mean level and the shares of episodes that moved up and down."""
+        """Return terrain type -> text with its mean level and the shares of episodes after which a robot moved up or down."""
         found = {}
         for key, level in self.values.items():
             name = key.removeprefix("Terrain/level_")

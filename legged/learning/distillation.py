@@ -1,5 +1,5 @@
-"""rsl-rl's distillation without host reads in the update. The student acts, and learns the actions that the teacher would
-have taken.
+"""rsl-rl's distillation with an update in which the host reads no values from the device. The student acts, and learns the
+actions that the teacher would have taken.
 """
 
 import warnings
@@ -28,7 +28,7 @@ class DeviceDistillation(Distillation):
     def __init__(self, student: MLPModel, teacher: MLPModel, *args: Any, stock: bool = False, **kwargs: Any) -> None:
         for parameter in student.distribution.parameters():  # no loss depends on the noise of the student's actions
             parameter.requires_grad_(False)
-        with warnings.catch_warnings():  # no warning of gradient_length: the configuration has checked it
+        with warnings.catch_warnings():  # rsl-rl warns of gradient_length, which the configuration has checked
             warnings.simplefilter("ignore")
             super().__init__(student, teacher, *args, **kwargs)
         name = kwargs.get("optimizer", "adam")
@@ -40,7 +40,7 @@ class DeviceDistillation(Distillation):
         else:
             on_gpu = parameters[0].is_cuda
             self.optimizer = torch.optim.Adam(parameters, lr=self.learning_rate, fused=True, capturable=on_gpu)
-            # While this is 1, a fused step changes nothing: neither the parameters, nor the moments, nor the step count.
+            # While found_inf is 1, a fused step leaves the parameters, the moments and the step count unchanged.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
@@ -60,8 +60,8 @@ class DeviceDistillation(Distillation):
 
     @property
     def fits_graph(self) -> bool:
-        """True if an update can be captured. With recurrent layers it can't, because the GPU's library decides which kernels
-        it launches.
+        """True if a CUDA graph can capture the update. This is not possible with recurrent layers, because NVIDIA's library
+        for these layers decides itself which kernels to launch.
         """
         return not self.student.is_recurrent
 
@@ -83,7 +83,7 @@ class DeviceDistillation(Distillation):
         return self.losses()
 
     def learn(self, epochs: int | None = None) -> None:
-        """Learn from the stored rollout for `epochs` epochs, by default all configured ones, without a host read."""
+        """Learn from the stored rollout for `epochs` epochs, by default all configured ones. The host reads nothing."""
         self._losses.zero_()
         epochs = epochs or self.num_learning_epochs
         observations = self.storage.observations
@@ -96,14 +96,14 @@ class DeviceDistillation(Distillation):
             update_normalizer(self.student.obs_normalizer, inputs.flatten(0, 1))
 
     def outcome(self) -> dict[str, Tensor]:
-        """Return the results of an update, on the device: `losses` (2,), which the method `losses` takes once they are on the
-        host, and the standard deviation `std` (D,) of the actions.
+        """Return the results of an update, on the device: `losses` (2,) and the standard deviation `std` (D,) of the actions.
+        The method `losses` takes the tensor `losses` after its transfer to the host.
         """
         return {"losses": self._losses, "std": self.action_std()}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean loss of a step, and set `left_out`. `numbers` are the `losses` of `outcome`, read on the host; if
-        None, the last update's results are read from the device. The loss is NaN if no gradient was used.
+        """Return the mean loss of a step, and set `left_out`. `numbers` are the `losses` of `outcome`, after their
+        transfer to the host. By default they are read from the device now. The loss is NaN if no gradient was used.
         """
         loss, taken = self._losses.tolist() if numbers is None else numbers
         self.left_out = 1.0 - taken
@@ -133,7 +133,7 @@ class DeviceDistillation(Distillation):
         self.memory.take(memory.parts)
 
     def _descend(self, loss: Tensor) -> None:
-        """Take a gradient step on `loss` (), the sum over `gradient_length` steps, unless a gradient is NaN or infinite."""
+        """Take a gradient step, unless a gradient is NaN or infinite. `loss` () is a sum over `gradient_length` steps."""
         mean = loss.detach() / self.gradient_length
         if self.is_multi_gpu:
             self._shared.zero_()

@@ -23,7 +23,7 @@ def check_reachable(ranks: Ranks) -> None:
     missing = [name for name in ("MASTER_ADDR", "MASTER_PORT") if not os.environ.get(name)]
     if ranks.several and missing:
         raise ConfigError(
-            f"WORLD_SIZE: the environment says that {ranks.count} processes train together, but lacks"
+            f"WORLD_SIZE: the variable says that {ranks.count} processes train together, but there is no value for"
             f" {' and '.join(missing)}; start with torchrun, or unset WORLD_SIZE to train with one process"
         )
 
@@ -64,16 +64,16 @@ def any_rank(asked: bool, device: torch.device) -> bool:
 
 
 class SharedGradients:
-    """Buffer for the gradients of all parameters, which is averaged over all processes in one operation.
+    """Buffer that holds the gradients of all parameters, so that one operation averages them over all processes.
 
     The end of the buffer holds further numbers on which a gradient step depends, such as the divergence that sets the
-    learning rate. So all processes take the same step, or all skip it.
+    learning rate. They are averaged too, so all processes take the same step, or all skip it.
     """
 
     MOST_NUMBERS = 2
 
     def __init__(self, parameters: list[torch.nn.Parameter], count: int) -> None:
-        """Make the parameters' gradients views of the buffer. `count` is the number of processes."""
+        """Allocate the buffer. Each parameter's gradient becomes a view of it. `count` is the number of processes."""
         self._count = count
         sizes = [p.numel() for p in parameters]
         self._buffer = torch.zeros(sum(sizes) + self.MOST_NUMBERS, device=parameters[0].device)

@@ -45,7 +45,7 @@ class DivergenceDetector:
                 say(f"{term(name)} of {robots} {MEANING.get(name, 'was NaN or infinite')}; logged as {FAULT}{name}")
         if left_out > 0.0 and MINI_BATCHES not in self._said:
             self._said.add(MINI_BATCHES)
-            say(f"{100 * left_out:.0f} % of the mini-batches had gradients that were NaN or infinite, and were left out")
+            say(f"{100 * left_out:.0f} % of the mini-batches were left out, because a gradient was NaN or infinite")
         reset = values.get("Metrics/non_finite_worlds", 0.0) / self._steps
         wrong = reset >= SHARE_OF_ROBOTS or left_out >= SHARE_OF_BATCHES
         self._in_a_row = self._in_a_row + 1 if wrong else 0
@@ -58,11 +58,11 @@ class DivergenceDetector:
 
 
 MEANING = {"physics": "went out of bounds, so they were reset", "action": "was NaN, so they were reset"}
-"""Fault -> description, for the faults that are not simply a NaN or infinite term."""
+"""Fault -> description. A fault without an entry here is a term that was NaN or infinite."""
 
 
 def term(name: str) -> str:
-    """Return the name of a fault as text: '_reward_torques' for the term 'reward_torques', or 'the physics'."""
+    """Return a fault as text: 'physics' -> 'the physics', and for terms 'reward_torques' -> '_reward_torques'."""
     return f"the {name}" if name in MEANING else f"_{name}"
 
 

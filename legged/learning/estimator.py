@@ -65,7 +65,7 @@ class EstimatingModel(MLPModel):
 
     def joined(self, x: Tensor, found: Tensor) -> Tensor:
         """Return the input of the policy's layers: normalised observations `x` (..., I), followed by the estimator's output
-        `found` (..., E + L). The estimates are detached, unless the policy's gradient is to train them.
+        `found` (..., E + L). With `policy_gradient`, the policy's loss also trains the estimates. Else they are detached.
         """
         if self._policy_gradient:
             return torch.cat([x, found], dim=-1)
@@ -93,7 +93,7 @@ class EstimatingModel(MLPModel):
 
 
 class EstimatingLayers(nn.Module):
-    """Copy, for export, of all layers of an EstimatingModel after its normaliser."""
+    """Copy of the layers of an EstimatingModel, for export. The normaliser is not included."""
 
     def __init__(self, model: EstimatingModel) -> None:
         """Copy the layers of `model`."""

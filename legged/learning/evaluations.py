@@ -78,10 +78,10 @@ class Evaluations:
         return iterations == total or iterations % self._runner.evaluate_interval == 0
 
     def due(self, iterations: int, total: int, loop_s: float) -> bool:
-        """Return True if an evaluation is due after `iterations` of `total` iterations. So far they have taken `loop_s` [s].
+        """Return True if an evaluation is due after `iterations` of `total` iterations and `loop_s` [s] of training.
 
-        An evaluation is due at the end. At an interval it is due if it is the first, or if `evaluate_share` leaves time for
-        two evaluations: this one and the one at the end.
+        An evaluation is due at the end. At every `evaluate_interval` it is due if it is the first, or if the share
+        `evaluate_share` of the training time is enough for two more evaluations: this one and the one at the end.
         """
         if iterations == total:
             return True
@@ -112,7 +112,7 @@ class Evaluations:
         if target and all(reaches(name, found.figures[name], value) for name, value in target.items()):
             self.reached = True
             values = ", ".join(f"{name} {found.figures[name]:.4g} (stop_at {value:g})" for name, value in target.items())
-            self.why_end = f"reached its target after {found.iterations} iterations: {values}"
+            self.why_end = f"the training reached its target after {found.iterations} iterations: {values}"
         if self.listener is not None and not self.why_end:
             self.why_end = self.listener(found)
 
@@ -153,7 +153,7 @@ class Evaluations:
 
 
 def is_better(figure: str, value: float, than: float) -> bool:
-    """Return True if `value` of a figure is better than another value, `than`."""
+    """Return True if `value` is better than the value `than` of the same figure."""
     return value < than if lower_is_better(figure) else value > than
 
 

@@ -1,4 +1,4 @@
-"""Protection of the networks against NaN gradients in rsl-rl's own update, which calls torch's optimiser itself."""
+"""Protection of the networks against NaN gradients in rsl-rl's own update. A hook checks each step of torch's optimiser."""
 
 from typing import Any
 

@@ -1,7 +1,7 @@
 """Task and settings from the command line of a training, stored in the run folder as given.json.
 
-The name of a user-defined task is not enough to find the task: the module or file that defines it must be known. So a report
-names that file in its commands. If a report can't load the task, it shows the settings of the command line.
+A user-defined task is found only if the module or YAML file that defines it is known. So the commands in a report name this
+module or file. A report on a task that can't be found shows the settings of the command line.
 """
 
 import json
@@ -26,7 +26,7 @@ class Invocation:
     task: str
     """Name of the task, or its YAML file."""
     module: str | None = None
-    """Value of --import."""
+    """Value of the option `--import`."""
     changes: Mapping[str, Any] = field(default_factory=dict)
     """Dotted path -> value. A resumed training also has the settings of earlier command lines."""
 
@@ -45,7 +45,7 @@ def write_invocation(folder: Path, invocation: Invocation, before: Path | None =
     """
     earlier: Mapping[str, Any] = {}
     if before is not None:
-        with suppress(ConfigError):  # skip a damaged file; a report on that run names it
+        with suppress(ConfigError):  # a damaged file is skipped here and named in the report on that run
             earlier = (read_invocation(before) or invocation).changes
     said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
     write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")
@@ -67,4 +67,4 @@ def read_invocation(folder: Path) -> Invocation | None:
                 raise TypeError(f"{name}: got {shown(said[name])}")
         return Invocation(said["task"], said["import"], said["changes"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ConfigError(f"{relative(path)}: is not the invocation of a training ({error})") from error
+        raise ConfigError(f"{relative(path)}: not the task and settings of a training ({error})") from error

@@ -1,4 +1,4 @@
-"""rsl-rl's logger, which writes to TensorBoard, with this package's display on the console. It also decides when a training
+"""rsl-rl's logger for TensorBoard, extended by this package's display on the console. The logger also decides when a training
 stops.
 """
 
@@ -34,8 +34,8 @@ class QuietLogger(Logger):
     device: str
 
     def __init__(self, *args: Any, display: Display | None = None, left_out: Callable[[], float], **kwargs: Any) -> None:
-        """Take `left_out`, which returns the share of the last update's mini-batches that were skipped. Other arguments are
-        rsl-rl's.
+        """Take `left_out`, which returns the share of the last update's mini-batches that were skipped. `args` and `kwargs`
+        are rsl-rl's arguments.
         """
         super().__init__(*args, **kwargs)
         self.display, self._left_out = display, left_out
@@ -45,7 +45,7 @@ class QuietLogger(Logger):
         """Function of the number of finished iterations and the total number. It evaluates the policy if an evaluation is
         due, and returns the figures."""
         self.why_end: Callable[[], str] | None = None
-        """Function that returns why the last evaluation ends the training, or an empty text; None if no process evaluates."""
+        """Function that returns the reason to end the training, or an empty text. It is None if no process evaluates."""
         self.neighbours: Neighbours | None = None
         """Counter of other trainings on this device, which slow this one down. It is None in all processes but the first."""
         self.loop_s = 0.0
@@ -96,7 +96,7 @@ class QuietLogger(Logger):
         values: dict[str, float] = {}
         names = dict.fromkeys((name for entry in self.ep_extras for name in entry if not name.startswith(FAULT)), math.nan)
         for entry in self.ep_extras:
-            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer instead of twenty
+            stacked = torch.stack([value.reshape(()) for value in entry.values()]).tolist()  # one transfer for all values
             values.update({key: value for key, value in zip(entry, stacked, strict=True) if value == value})
         evaluated = self.evaluate(it + 1, total_it)
         values.update({f"{SECTION}{name}": value for name, value in evaluated.items() if math.isfinite(value)})
@@ -106,7 +106,7 @@ class QuietLogger(Logger):
         left_out = self._left_out()
         if left_out > 0.0:
             values[MINI_BATCHES] = left_out
-        self.ep_extras[:] = [dict(values)] if values else []  # a copy, because rsl-rl adds tensors to it
+        self.ep_extras[:] = [dict(values)] if values else []  # rsl-rl adds tensors to this copy of `values`
         kl = self.kl_meter.flush() if self.kl_meter else None
         losses = {name: loss for name, loss in given.items() if name not in estimated} | ({} if kl is None else {"kl": kl})
         losses = {name: loss for name, loss in losses.items() if math.isfinite(loss)}

@@ -106,7 +106,7 @@ def reset_std(actor: MLPModel, cfg: TaskConfig) -> None:
 def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> None:
     """Clamp a learned standard deviation to its bounds after each step of the optimiser.
 
-    rsl-rl clamps the value at each use. A parameter outside the bounds then has no gradient, so it would never return.
+    rsl-rl clamps the value at each use. A parameter outside the bounds then has no gradient, so it would stay outside.
     """
     distribution = actor.distribution
     if type(distribution) is not GaussianDistribution or tuple(distribution.std_range) == UNBOUNDED:
@@ -126,9 +126,9 @@ def keep_std_in_bounds(actor: MLPModel, optimizer: torch.optim.Optimizer) -> Non
 def use_matmul(cfg: TaskConfig) -> None:
     """Set the precision of matrix products on a GPU, and their library on a CPU, for this process.
 
-    On AVX-512 processors of other makers than Intel, torch's default library MKL takes 2.5 times as long as oneDNN. torch
-    uses oneDNN if bfloat16 is allowed. On a processor without bfloat16 units (AMX), oneDNN computes in float32 even then. On
-    a processor with these units bfloat16 is not allowed, so MKL is used.
+    On AVX-512 processors that are not from Intel, torch's default library MKL takes 2.5 times as long as oneDNN. torch uses
+    oneDNN if its settings allow bfloat16. On processors without bfloat16 units (AMX) this function allows bfloat16, but
+    oneDNN still computes in float32. On processors with these units the function forbids bfloat16, so torch uses MKL.
     """
     rounded = cfg.train.runner.matmul == "tf32"
     torch.backends.cuda.matmul.allow_tf32 = rounded

@@ -1,5 +1,5 @@
-"""rsl-rl's PPO without host reads in the update. Losses and gradient steps are those of rsl-rl, but losses are computed in
-closed form, and data is shuffled once per update.
+"""rsl-rl's PPO with an update in which the host reads no values from the device. Losses and gradient steps are those of
+rsl-rl, but losses are computed in closed form, and data is shuffled once per update.
 """
 
 import math
@@ -18,7 +18,7 @@ from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
 from legged.learning.networks import action_std, layers_of, output_of, update_normalizer
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
-"""Bounds of the adaptive learning rate and the factor of one change, as in rsl-rl."""
+"""Bounds of the adaptive learning rate, and the factor by which one adaptation raises or lowers it, as in rsl-rl."""
 FEW = 1e-8
 LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 """Logged losses of an update, by rsl-rl's names. `kl` is the divergence from the policy that acted to the policy that learns.
@@ -47,7 +47,7 @@ class DevicePPO(CriticWarmup):
             parameters = [p for part in self._parts() for p in part]
             capturable = self._rate.is_cuda
             self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
-            # While this is 1, a fused step changes nothing: neither the parameters, nor the moments, nor the step count.
+            # While found_inf is 1, a fused step leaves the parameters, the moments and the step count unchanged.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
                 self._shared = SharedGradients(parameters, self.gpu_world_size)
@@ -58,12 +58,12 @@ class DevicePPO(CriticWarmup):
         each term if there is an estimator, and the share of mini-batches that were used."""
         self._one = torch.ones((), device=self.device)
         self._critic_alone = False
-        """True during an update, or its capture, that changes only the value function."""
+        """True while an update of the value function alone runs or is captured."""
         self.left_out = 0.0
         """Share of the last update's mini-batches that were skipped, because a gradient was NaN or infinite."""
 
     fits_graph = True
-    """True if an update can be captured. Features that can't be captured use rsl-rl's own loop."""
+    """True if a CUDA graph can capture an update. Features that can't be captured use rsl-rl's own loop."""
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
         """Set the object that measures estimation errors, and the learning rate of the actor's estimator. Call this once,
@@ -190,15 +190,15 @@ class DevicePPO(CriticWarmup):
         self._update_normalizers()
 
     def outcome(self) -> dict[str, Tensor]:
-        """Return the results of an update, on the device: `losses` (K,), which the method `losses` takes once they are on the
-        host, the standard deviation `std` (D,) of the actions, and the learning `rate` ().
+        """Return the results of an update, on the device: `losses` (K,), the standard deviation `std` (D,) of the actions,
+        and the learning `rate` (). The method `losses` takes the tensor `losses` after its transfer to the host.
         """
         rate = {} if self._rate is None else {"rate": self._rate}
         return {"losses": self._losses, "std": self.action_std(), **rate}
 
     def losses(self, numbers: Sequence[float] | None = None) -> dict[str, float]:
-        """Return the mean losses of an update, and set `left_out`. `numbers` are the `losses` of `outcome`, read on the host;
-        if None, the last update's results are read from the device.
+        """Return the mean losses of an update, and set `left_out`. `numbers` are the `losses` of `outcome`, after their
+        transfer to the host. By default they are read from the device now.
 
         Losses are NaN if all mini-batches were skipped. With an estimator, its root mean square errors are added as
         `Estimator/<term>_rmse`, each in the term's unit.
@@ -245,7 +245,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples. It comes from sorting random numbers, which a graph can hold."""
+        """Return a random permutation of `count` samples, from a sort of random numbers. A CUDA graph can hold this sort."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -262,7 +262,7 @@ class DevicePPO(CriticWarmup):
         targets: Tensor | None = None,
     ) -> Tensor:
         """Adapt the learning rate and take a gradient step on one mini-batch. Return its losses in the order of `LOSSES`, its
-        estimation errors, and 1. If a gradient is NaN or infinite, change nothing and return zeros.
+        estimation errors, and 1. If a gradient or the value loss is NaN or infinite, take no step and return zeros.
         """
         samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
@@ -296,8 +296,8 @@ class DevicePPO(CriticWarmup):
             losses.append((mean[samples:] - images[samples:]).square().mean())
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
-        losses.insert(LOSSES.index("kl"), kl)  # this tensor is averaged over the processes below
-        # A NaN value may not show in the gradient of the clipped value loss, so the loss itself is checked as well.
+        losses.insert(LOSSES.index("kl"), kl)  # below, `average_` averages this tensor over all processes
+        # If the critic returns NaN, the gradient of the clipped value loss may be finite, so the loss is checked as well.
         valued = value_loss.detach().clone()
         if self._critic_alone:
             loss = self.value_loss_coef * value_loss
@@ -322,7 +322,7 @@ class DevicePPO(CriticWarmup):
         a gradient is NaN or infinite.
 
         The actor's gradients are set to None, because the optimiser skips parameters without a gradient. With zero gradients
-        it would count a step, and the first real steps would then be too large.
+        Adam would count a step, and the first real steps of the actor would then be too large.
         """
         of_actor = [(parameter, parameter.grad) for parameter in self.actor.parameters()]
         for parameter, _ in of_actor:
@@ -330,7 +330,7 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # with several processes it is a view of the shared buffer
+        for parameter, gradient in of_actor:  # with several processes, `gradient` is a view of the shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 
@@ -348,8 +348,8 @@ class DevicePPO(CriticWarmup):
         return norms.sum()
 
     def _act(self, inputs: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the mean actions (n, D) for the actor's inputs (n, width), and the estimates (n, E), None without an
-        estimator.
+        """Return the mean actions (n, D) for the actor's inputs (n, width). Also return the estimates (n, E), or None
+        without an estimator.
         """
         actor, mixed = self.actor, self.use_mixed_precision
         if not isinstance(actor, EstimatingModel):

@@ -32,7 +32,7 @@ def keep_shape_of_one_robot(policy: Any) -> None:
     """Make a recurrent policy of rsl-rl return the log-probabilities of T steps of one robot as (T,).
 
     If a mini-batch has a single robot, rsl-rl squeezes the old log-probabilities to (T,), but the new ones are (T, 1). Their
-    ratio would be broadcast to (T, T), every step with every other step. Log-probabilities of several robots, (T, n), and of
+    ratio would be broadcast to (T, T), which mixes different steps. Log-probabilities of several robots, (T, n), and of
     one step, (N,), stay unchanged.
     """
     ask = policy.get_output_log_prob
@@ -61,7 +61,8 @@ def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
 class Memory:
     """Hidden state of one of rsl-rl's networks for N robots; empty for a network without recurrent layers.
 
-    `take` keeps the addresses of the tensors, as a graph needs. The other methods make new tensors, as autograd needs.
+    `take` keeps the addresses of the tensors, so that a CUDA graph can use them. `act`, `forget` and `detach` make new
+    tensors, because autograd needs the old ones.
     """
 
     def __init__(self, network: Any, num_envs: int, parts: list[Tensor] | None = None) -> None:
@@ -83,7 +84,7 @@ class Memory:
         return self.network.distribution.deterministic_output(self.network.mlp(x))
 
     def forget(self, ended: Tensor) -> None:
-        """Reset the hidden state of the robots whose episodes `ended` (N, 1)."""
+        """Reset the hidden state of the robots for which the mask `ended` (N, 1) is True."""
         self.parts = [part.masked_fill(ended, 0.0) for part in self.parts]
 
     def detach(self) -> None:

@@ -40,7 +40,7 @@ def resumed(
     cfg = override(before, asked)
     if isinstance(cfg, LeggedConfig) and isinstance(before, LeggedConfig) and cfg.robot != before.robot:
         raise ConfigError(
-            f"{cfg.origins.where('robot')}: a resumed training keeps its robot, '{before.robot}'; got '{cfg.robot}'"
+            f"{cfg.origins.where('robot')}: a resumed training keeps its robot '{before.robot}'; got '{cfg.robot}'"
         )
     for key in KEPT:
         old, new = (value_at(to_dict(one), key) for one in (before, cfg))

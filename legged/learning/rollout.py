@@ -1,4 +1,4 @@
-"""Rollout without host reads. Observations, actions, rewards and returns go straight into rsl-rl's storage."""
+"""Rollout in which the host reads no values from the device. All results go straight into rsl-rl's storage."""
 
 from abc import ABC, abstractmethod
 
@@ -11,8 +11,8 @@ from legged.learning.ppo import DevicePPO, gaussian_log_prob
 
 
 class Steps(ABC):
-    """Rollout of T control steps as in rsl-rl's training loop, but as one function that a graph can hold. A subclass computes
-    the actions (`_act`), and the quantities that need all steps (`_finish`).
+    """Rollout of T control steps as in rsl-rl's training loop, but as one function that a CUDA graph can hold. A subclass
+    computes the actions (`_act`), and the quantities that need all steps (`_finish`).
     """
 
     def __init__(self, env: BaseTask, storage: RolloutStorage) -> None:
@@ -21,10 +21,10 @@ class Steps(ABC):
         st = storage
         self._observations = {name: group.buffer for name, group in env.observation_groups.items()}
         self._cut_off = torch.zeros_like(st.rewards)
-        """Tensor (T, N, 1), 1 where the step ended its episode by a time-out."""
-        # These sums are kept for each robot and added up at the end of the rollout, which saves launches in each step.
+        """Tensor (T, N, 1) with 1 where an episode ended by a time-out in this step, else 0."""
         self._so_far = torch.zeros(2, env.num_envs, device=env.device)
         self._return, self._length = self._so_far.unbind()
+        # `_ended` holds sums of each robot. Adding up the robots only at the end of the rollout saves kernel launches.
         self._ended = torch.zeros(3, env.num_envs, device=env.device)
         self._zero = torch.zeros((), device=env.device)
         self._return_at = torch.zeros_like(st.rewards).squeeze(-1)  # (T, N) return of the episode so far, after each step
@@ -43,7 +43,7 @@ class Steps(ABC):
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """Make T steps, or `steps` of them for a rehearsal, and compute the quantities that need all steps."""
+        """Make `steps` steps, by default T, and compute the quantities that need all steps."""
         self._ended.zero_()
         for t in range(steps or self.storage.num_transitions_per_env):
             self._step(t)

@@ -1,4 +1,4 @@
-"""Run folders: logs/<experiment>/<date_time>_<run>/ with configuration, code state, TensorBoard and checkpoints."""
+"""Run folders: logs/<experiment>/<date_time>_<run>/ with configuration, code state, TensorBoard files and checkpoints."""
 
 import itertools
 import os
@@ -34,7 +34,7 @@ GIT_S = 30.0
 
 
 def experiment_folder(cfg: TaskConfig) -> Path:
-    """Return the folder of a task's runs. It is always in logs/, because the configuration allows no path as a name."""
+    """Return the folder of a task's runs. It is always in logs/, because the experiment's name must not be a path."""
     return LOGS / (cfg.train.runner.experiment_name or cfg.task)
 
 
@@ -57,7 +57,7 @@ def create_run(cfg: TaskConfig) -> Path:
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error
-    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # a copy, in case the original moves
+    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # the run keeps a copy of the network's file
         write_bytes(folder / MOTORS, Path(cfg.control.actuator.network).read_bytes())
         cfg = replace(cfg, control=replace(cfg.control, actuator=replace(cfg.control.actuator, network=MOTORS)))
     write_text(folder / CONFIG_FILE, to_yaml(cfg))
@@ -148,7 +148,7 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
             raise ConfigError(f"{where}: there is no run with a checkpoint in {relative(parent)}{which}; train one first")
         return runs[-1]
     for folder in (parent / str(load_run), Path(str(load_run))):
-        with suppress(OSError, ValueError):  # it may not be a valid folder name
+        with suppress(OSError, ValueError):  # `load_run` can be an invalid folder name
             if str(load_run).strip() and folder.is_dir():
                 return folder
     raise ConfigError(f"--load-run: there is no run '{load_run}'{suggest(str(load_run), [p.name for p in runs], 'runs')}")
@@ -169,7 +169,7 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
         ConfigError: there is no such run.
     """
     top = data_folder("resources").parent
-    with suppress(OSError, ValueError):  # it may not be a valid folder name
+    with suppress(OSError, ValueError):  # `name` can be an invalid folder name
         for folder in (parent / name for parent in (Path(), LOGS, top) if name.strip()):
             if exists(folder / CONFIG_FILE):
                 return folder
@@ -210,7 +210,8 @@ def own_run(name: str, where: str) -> Path:
 
 
 def newest_run(where: str) -> Path:
-    """Return the folder in logs/ of the run that saved a checkpoint last. A run without one counts by its start.
+    """Return the folder in logs/ of the run that saved a checkpoint last. If a run has no checkpoint, the time of
+    its start counts.
 
     Raises:
         ConfigError: there is no run.
@@ -226,7 +227,7 @@ def _has_begun(folder: Path) -> bool:
 
 
 def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
-    """Return a checkpoint of a run folder. `checkpoint` is an iteration, BEST for the best policy of the evaluations during
+    """Return a checkpoint of a run folder. `checkpoint` is an iteration, BEST for the policy with the best evaluation during
     training, or None for the latest checkpoint.
 
     Raises:
@@ -249,9 +250,9 @@ def find_checkpoint(folder: Path, checkpoint: int | str | None) -> Path:
 
 
 def of_another_policy(folder: Path, checkpoint: object) -> bool:
-    """Return True if `checkpoint`, the name of an evaluated file, is not the last checkpoint in `folder`: training has gone
-    on since, or an earlier checkpoint was evaluated. For a shipped policy return False, because its original file name is
-    unknown.
+    """Return True if `checkpoint`, the name of an evaluated file, is not the name of the last checkpoint in `folder`. Then
+    training went on after the evaluation, or an earlier checkpoint was evaluated. For a shipped policy return False,
+    because its original file name is unknown.
     """
     found = checkpoints(folder)
     last = found[max(found)].name if found else SHIPPED_MODEL
@@ -294,7 +295,7 @@ def checkpoints(folder: Path) -> dict[int, Path]:
     found: dict[int, Path] = {}
     for path in folder.glob("model*.pt"):
         match = re.fullmatch(r"model_(\d+)\.pt", path.name, re.ASCII)
-        if not path.is_file():  # a folder with that name, or a broken link
+        if not path.is_file():  # skip folders and broken links
             continue
         if match:
             found[int(match.group(1))] = path

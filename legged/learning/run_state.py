@@ -1,5 +1,5 @@
-"""State of a training beyond its checkpoint: random generators, robots, episodes. With this state a resumed training
-continues as if it had never stopped. Without it, robots start anew.
+"""State of a training that its checkpoint does not hold: random generators, robots, episodes. With this state a resumed
+training continues as if it had never stopped. Without this state, robots start anew.
 
 The state's size grows with the number of robots, so only the newest state is kept: state_<iteration>.pt next to
 model_<iteration>.pt.
@@ -35,7 +35,7 @@ STATE_SETTINGS = (
     "env.num_envs",
 )
 """Settings whose effects are stored in the state. If one of them changes, the robots can't continue from the state, because
-they would still have the old values."""
+the state depends on the old value."""
 
 
 def state_path(checkpoint: Path) -> Path:
@@ -51,7 +51,7 @@ def write_run_state(checkpoint: Path, state: dict[str, Any]) -> None:
 
 
 def remove_older(checkpoint: Path) -> None:
-    """Remove the states of the other checkpoints in the folder."""
+    """Remove the states of all checkpoints in the folder except `checkpoint`."""
     for path in checkpoint.parent.glob("state_*.pt"):
         if path != state_path(checkpoint):
             path.unlink(missing_ok=True)
@@ -74,7 +74,7 @@ def read_run_state(checkpoint: Path, checkpoint_id: str) -> dict[str, Any]:
     if not isinstance(state, dict) or not all(isinstance(state.get(name), kind) for name, kind in kinds.items()):
         raise StateError(f"{relative(path)} is damaged")
     if state["format"] != FORMAT:
-        raise StateError(f"{relative(path)} is of format {state['format']}, this version reads {FORMAT}")
+        raise StateError(f"{relative(path)} has format {state['format']}, but this version reads format {FORMAT}")
     if state["id"] != checkpoint_id:
         raise StateError(f"{relative(path)} belongs to another checkpoint")
     return state
@@ -118,7 +118,7 @@ def set_generators(state: dict[str, Any]) -> None:
         torch.set_rng_state(state["torch"])
         if isinstance(state["cuda"], Tensor) and torch.cuda.is_available():
             torch.cuda.set_rng_state(state["cuda"])
-    except Exception as error:  # each generator raises its own types for a wrong state
+    except Exception as error:  # each generator raises its own error types for a wrong state
         raise StateError(f"the state of the random generators is damaged ({error})") from error
 
 

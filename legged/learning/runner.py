@@ -1,4 +1,4 @@
-"""rsl-rl's OnPolicyRunner, with the task's state in checkpoints, atomic writes and a clean stop."""
+"""rsl-rl's OnPolicyRunner. Its checkpoints also hold the task's state and are written atomically, and it can stop cleanly."""
 
 import contextlib
 import io
@@ -97,7 +97,7 @@ class Runner(OnPolicyRunner):
     def __init__(
         self, env: BaseTask, log_dir: Path | None = None, device: str = "cpu", display: Display | None = None
     ) -> None:
-        """Take the folder `log_dir` for checkpoints and TensorBoard files; None writes nothing."""
+        """Write checkpoints and TensorBoard files to the folder `log_dir`, or write nothing if it is None."""
         config = self._configuration(env)
         use_matmul(env.cfg)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -160,7 +160,7 @@ class Runner(OnPolicyRunner):
         steps = logger.tot_timesteps + logger.steps_per_iteration
         best = evaluations.evaluate(self.alg.get_policy(), iterations, logger.loop_s, steps)
         figures = evaluations.history[-1].figures
-        found = {name: value for name, value in figures.items() if math.isfinite(value)}  # a checkpoint holds no NaN
+        found = {name: value for name, value in figures.items() if math.isfinite(value)}  # checkpoints can't hold NaN
         if best and logger.writer is not None:
             path = Path(logger.log_dir) / BEST_MODEL
             write_checkpoint(path, self._content(path, {"evaluation": found}))
@@ -168,8 +168,8 @@ class Runner(OnPolicyRunner):
         return found
 
     def train(self, until_iteration: int) -> bool:
-        """Train up to iteration `until_iteration`, or until the target is reached, and save a checkpoint. Return False if the
-        training was stopped earlier. At the end, leave the process group.
+        """Train up to iteration `until_iteration`, or until evaluations reach the target `stop_at`, and save a checkpoint.
+        Return False if the training was stopped earlier. At the end, leave the process group.
 
         Raises:
             RankLost: another process has died.
@@ -179,7 +179,8 @@ class Runner(OnPolicyRunner):
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # Processes without evaluations get Ended too. With several processes it means that the target is reached.
+            # Only the first process has evaluations, but all get Ended. With several processes, Ended always means that the
+            # target is reached.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -191,14 +192,14 @@ class Runner(OnPolicyRunner):
             good = f"; the last checkpoint is {self._last_saved}" if self._last_saved else ""
             raise Diverged(f"stopped after iteration {self.current_learning_iteration + 1}: {error}{good}") from error
         except RuntimeError as error:
-            if self.is_distributed and "by peer" in str(error):  # gloo's text; with NCCL, torchrun reports
+            if self.is_distributed and "by peer" in str(error):  # gloo's error; with NCCL, torchrun reports a lost process
                 raise RankLost(f"rank {self.gpu_global_rank}: another process has ended; torchrun says which") from error
             raise
         leave()
         return finished
 
     def _configure_multi_gpu(self) -> None:
-        """Join the process group as rsl-rl does, but on the CPU too, and with the device that torchrun gave each process."""
+        """Join the process group on GPUs or on the CPU. rsl-rl's own method supports only GPUs."""
         ranks = Ranks.now()
         self.is_distributed = ranks.several
         self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = ranks.count, ranks.rank, ranks.local_rank
@@ -212,7 +213,7 @@ class Runner(OnPolicyRunner):
             join(ranks, torch.device(self.device))
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
-        """Train for a number of iterations. Robots that continue from a state keep their episodes."""
+        """Train for a number of iterations. Robots that continue from a saved state keep their episodes."""
         warmup = self.env.cfg.train.algorithm.critic_warmup_iterations
         self.alg.warmup_left = max(0, warmup - self.current_learning_iteration)
         goes_on = self._restore_state()
@@ -225,7 +226,7 @@ class Runner(OnPolicyRunner):
             RunError: weights are NaN or infinite, or a file can't be written.
         """
         saved = self._content(Path(path), infos)
-        if not self.is_distributed:  # each process has only its own robots
+        if not self.is_distributed:  # with several processes, none has the states of all robots
             saved["infos"]["id"] = uuid4().hex
             state = {"generators": generators(), "task": self.env.state_dict(), "episodes": self._episodes()}
             state["memory"] = {name: tensor.clone() for name, tensor in self._memory().items()}
@@ -239,7 +240,7 @@ class Runner(OnPolicyRunner):
         """Return the content of a checkpoint, with the entries of `infos` added.
 
         Raises:
-            RunError: weights are NaN or infinite; the text names `path`, which is not written.
+            RunError: weights are NaN or infinite. The message says that `path` is not written.
         """
         saved = self.alg.save()
         try:
@@ -290,7 +291,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            waiting = len([*self.alg.get_policy().parameters()])  # in a critic warm-up the policy has no moments
+            waiting = len([*self.alg.get_policy().parameters()])  # a critic warm-up creates no moments of the policy
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)
@@ -330,8 +331,8 @@ class Runner(OnPolicyRunner):
         """Load a checkpoint, to continue its training. Return the reason why robots begin anew, or an empty text if they
         continue.
 
-        Robots, random numbers and episodes continue if the checkpoint has a state, and the terrain and the randomisation are
-        the same. Otherwise all robots begin anew on the tiles that they had reached.
+        Robots, random numbers and episodes continue if there is one process, the checkpoint has a state, and none of
+        `STATE_SETTINGS` has changed. Otherwise all robots begin anew on the terrain levels that they had reached.
         """
         infos = self.load(path)
         if self.is_distributed:
@@ -342,7 +343,7 @@ class Runner(OnPolicyRunner):
                 if (Path(path).parent / CONFIG_FILE).is_file():
                     check_same_world(run_config(Path(path).parent), self.env.cfg)
                 self._take(state)
-                self._state = state  # restored again when training begins, after the trial steps of a capture
+                self._state = state  # `learn` restores this again, because the capture of a CUDA graph makes trial steps
                 return ""
             except StateError as error:
                 why = str(error)

@@ -27,7 +27,7 @@ class StudentRollout(Steps):
 
     @torch.no_grad()
     def collect(self, steps: int | None = None) -> None:
-        """Make T steps, or `steps` of them for a rehearsal, and add the teacher's actions."""
+        """Make `steps` control steps, or a whole rollout if `steps` is None, and record the teacher's actions."""
         for before, now in zip(self.alg.memory_before, self.student.parts, strict=True):
             before.copy_(now)
         super().collect(steps)

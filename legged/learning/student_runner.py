@@ -28,7 +28,7 @@ class StudentRunner(CapturedRunner):
         device: str = "cpu",
         display: Display | None = None,
     ) -> None:
-        """Take a task `env` that also has the teacher's observations (`with_teacher`).
+        """Take the student's task `env`, which must have the teacher's observations too (see `with_teacher`).
 
         Raises:
             ConfigError: the teacher's weights do not fit its network.
@@ -45,7 +45,7 @@ class StudentRunner(CapturedRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for a number of iterations."""
-        if self.why_stock:  # rsl-rl's update starts from this hidden state
+        if self.why_stock:  # rsl-rl's own loop starts its update from `last_hidden_states`
             self.alg.last_hidden_states = (self.alg.student.get_hidden_state(), None)
         super().learn(num_learning_iterations, init_at_random_ep_len)
 
@@ -81,5 +81,5 @@ class StudentRunner(CapturedRunner):
         return saved
 
     def _set_rate(self, saved: float) -> None:
-        """Set the learning rate of the configuration. A student's learning rate is constant and has its own setting."""
+        """Set the learning rate to that of `train.distillation`, which is constant. The `saved` one is not used."""
         self.alg.learning_rate = self.alg.optimizer.param_groups[0]["lr"] = self.env.cfg.train.distillation.learning_rate

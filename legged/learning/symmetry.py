@@ -13,7 +13,7 @@ def images_of(task: BaseTask) -> MirrorImages:
     """Return the mirror images of a task's observations and actions.
 
     Raises:
-        ConfigError: the task has no mirror images, or a term's width does not fit the term's kind in `MIRRORED`.
+        ConfigError: the task has no mirror images, or its table `MIRRORED` does not fit an observation term.
     """
     images = task.mirror_images()
     if images is None:
@@ -25,7 +25,7 @@ def images_of(task: BaseTask) -> MirrorImages:
 def augment(
     images: MirrorImages, env: BaseTask, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """Append to a batch its mirror image: (n, ...) -> (2 n, ...). rsl-rl's symmetry extension calls this function, with
+    """Append its mirror image to a batch: (n, ...) -> (2 n, ...). rsl-rl's symmetry extension calls this function, with
     `images` already bound.
     """
     seen = done = None

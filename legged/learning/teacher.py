@@ -43,7 +43,7 @@ class Teacher:
     groups: Mapping[str, ObservationGroupConfig]
     """Observation groups that the policy reads, in order and without noise, by their names in the student's task."""
     network: Mapping[str, Any]
-    """Description of the network, as in checkpoints. `observations` has the groups' names in the student's task."""
+    """Description of the network, as in checkpoints. Its entry `observations` has the groups' names in the student's task."""
     weights: Mapping[str, Tensor]
 
     @property
@@ -119,7 +119,7 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
 
 
 def _observed_as(cfg: TaskConfig, name: str) -> str:
-    """Return the range by which an observed property is scaled, as text."""
+    """Return as text the range that scales the observation of a randomised property."""
     draw = observed(cfg, name)
     if draw is None:
         return "not drawn"
@@ -134,7 +134,7 @@ def _largest_forces(cfg: TaskConfig) -> str:
 
 
 def _shown(value: Any) -> str:
-    """Return a value as text for an error. The text of a long list has only its length and, for numbers, its ends."""
+    """Return a value as text for an error. A long list gives its length, a list of numbers also its first and last one."""
     if isinstance(value, tuple) and len(value) > 3:
         return f"{len(value)} from {value[0]:g} to {value[-1]:g}" if isinstance(value[0], float) else f"{len(value)} names"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -152,15 +152,15 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
     """Return the configuration of a student's task with the teacher's observation groups added.
 
     Raises:
-        ConfigError: a group of the student has the name of one of these groups.
+        ConfigError: the student has a different group with the name of a teacher's group.
     """
     groups = cfg.observations.groups
     for name, group in teacher.groups.items():
         if groups.get(name, group) != group:
             where = cfg.origins.where(f"observations.groups.{name}")
             raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
-    # A student has no value function to warm up. It does not learn from mirror images, so the teacher's observations need no
-    # mirror kind.
+    # A student has no value function to warm up, and does not learn from mirror images. Without `symmetry`, the checks of the
+    # task do not ask how the teacher's observations are mirrored.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)
     return replace(
         cfg,

@@ -18,9 +18,9 @@ class Timing:
 
     task: str
     finished: bool
-    """True if the training reached its last iteration or its target."""
+    """True if the training reached its last iteration or its target (`train.runner.stop_at`)."""
     robots: int
-    """Robots of all processes."""
+    """Number of robots in all processes."""
     iterations: int
     """Iterations made by this process, without the earlier iterations of a resumed training."""
     resumed: bool
@@ -31,8 +31,8 @@ class Timing:
     loop_s: float
     """Time in iterations [s]. It includes logging, except in rsl-rl's own loop."""
     wall_s: float
-    """Time since the start of the process [s]. It includes the two times above, the capture of graphs, checkpoints and
-    evaluations.
+    """Time since the start of the process [s]. It includes `start_up_s`, `loop_s`, checkpoints, evaluations and the
+    capture of CUDA graphs.
     """
     device: str
     kernels_compiled: int
@@ -41,7 +41,7 @@ class Timing:
     """Largest number of other trainings seen at one time on the same device. With several GPUs, only the first process's GPU
     counts."""
     error: str = ""
-    """Cause of the end, in one line; empty if the training ended at its last iteration or by a signal."""
+    """Error that ended the training, in one line; empty if no error ended it."""
     evaluation_s: float = 0.0
     """Time in evaluations during training [s]."""
 
@@ -67,7 +67,7 @@ def write_timing(folder: Path, timing: Timing) -> None:
 
 
 def read_timing(folder: Path) -> Timing | None:
-    """Read the times of a training from its run folder. Return None for runs of old versions, which lack them.
+    """Read the times of a training from its run folder. Return None without timing.json, as in runs of old versions.
 
     Raises:
         ConfigError: the file is damaged.

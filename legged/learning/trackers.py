@@ -1,5 +1,5 @@
-"""Experiment trackers, such as W&B, that get the log in addition to TensorBoard, through rsl-rl's writers. They are optional,
-and a failing tracker does not end a training.
+"""Experiment trackers, such as W&B. rsl-rl's writers send the log to a tracker. TensorBoard's file is written in any case.
+Trackers are optional, and a failing tracker does not end a training.
 """
 
 import inspect
@@ -53,7 +53,7 @@ def _writer_class(cfg: TaskConfig) -> type[LogWriter]:
     module, colon, attribute = name.partition(":")
     if not colon:
         allowed = suggest(name[:100], (TENSORBOARD, *known))
-        raise ConfigError(f"{where}: there is no tracker {shown(name)}{allowed}, or module:Class of a writer of your own")
+        raise ConfigError(f"{where}: there is no tracker {shown(name)}{allowed}; give your own writer as module:Class")
     find_modules_in(str(Path.cwd()))
     try:
         found = getattr(import_module(module), attribute)
@@ -145,7 +145,7 @@ class Tracker(LogWriter):
             return
         try:
             call()
-        except Exception as error:  # errors of the network or the tracker
+        except Exception as error:  # a lost connection or the tracker's code can raise anything
             self._failed = True
             text = " ".join(str(error).split()) or type(error).__name__
             print(f"warning: the tracker has failed and is no longer used: {text[:300]}", file=sys.stderr, flush=True)

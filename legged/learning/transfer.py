@@ -35,7 +35,7 @@ Terms = dict[str, int | None]
 def transferred(
     task: str, overrides: Iterable[tuple[str, Any]], source: str, iteration: int | str | None, on_cpu: bool
 ) -> tuple[TaskConfig, Path]:
-    """Return the configuration to train `task` with, and the checkpoint to begin with. `source` names a run or policy;
+    """Return the configuration of a training of `task`, and the checkpoint to begin with. `source` names a run or policy;
     `iteration` is a number, 'best', or None for the latest.
 
     The checkpoint is compared with the configuration as far as possible without building the task.
@@ -97,12 +97,12 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
     outputs = (*saved["actor_state_dict"][layers[-1]].shape, 0)[0] if layers else 0
     found = outputs // 2 if cfg.train.policy.state_dependent_std else outputs
     if found != task.num_actions:
-        raise ConfigError(f"{relative(path)}: its policy gives {found} actions, '{cfg.task}' takes {task.num_actions}")
+        raise ConfigError(f"{relative(path)}: its policy gives {found} actions, but '{cfg.task}' takes {task.num_actions}")
 
 
 def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
-    """Return `name` and `joints` of a checkpoint's robot; empty without a robot. For old files, the run's configuration gives
-    them.
+    """Return `name` and `joints` of a checkpoint's robot; empty if the task has no robot. If an old file lacks these
+    entries, the run's configuration gives them.
     """
     said: dict[str, Any] = saved["infos"].get("robot", {})
     if "joints" in said or saved["infos"].get("format", 1) > 1:
@@ -115,7 +115,7 @@ def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
 
 
 def terms_of(path: Path, saved: Saved) -> dict[str, Terms]:
-    """Return the terms of each observation group of a checkpoint. For old files, the run's configuration gives them."""
+    """Return the terms of each observation group of a checkpoint. For old files, the run's configuration gives the terms."""
     layout = saved["infos"].get("observations")
     if layout is not None:
         return layout
@@ -157,7 +157,7 @@ def first_difference(here: Terms, there: Terms) -> str:
 
 
 def _shown(term: tuple[str, int | None] | None) -> str:
-    """Return a term as text for an error, such as 'heights' (187)."""
+    """Return the text for a term in an error: its name and width, such as 'heights' (187)."""
     if term is None:
         return "none"
     name, width = term
@@ -177,7 +177,7 @@ def transfer_summary(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, lear
     if alone:
         warmup = cfg.train.algorithm.critic_warmup_iterations
         first = f"the value function is new and learns alone for {warmup} iterations"
-        with_std = "" if cfg.train.policy.state_dependent_std else f", with the std {cfg.train.policy.init_noise_std:g}"
+        with_std = "" if cfg.train.policy.state_dependent_std else f"; the std begins at {cfg.train.policy.init_noise_std:g}"
         anew = f"optimiser, iterations, curricula and robots begin anew{with_std}"
         return f"{_from(path, saved)}: {', '.join(taken)}\n{first}; {anew}"
     if "optimizer_state_dict" in saved and ours == theirs:
@@ -202,7 +202,7 @@ def _from(path: Path, saved: Saved) -> str:
 
 
 def _sizes(network: Mapping[str, Any]) -> str:
-    """Return the widths of a network's layers: (128, 64), with recurrent ones (lstm 256, 128, 64)."""
+    """Return the widths of a network's layers, such as (128, 64), or (lstm 256, 128, 64) with a recurrent layer."""
     kind = network.get("rnn_type", "none")
     recurrent = [] if kind == "none" else [f"{kind} {network['rnn_hidden_dim']}"] * network["rnn_num_layers"]
     return f"({', '.join([*recurrent, *map(str, network['hidden_dims'])])})"

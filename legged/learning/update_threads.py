@@ -1,4 +1,4 @@
-"""Number of threads for an update on the CPU: all cores, or one if other programs keep the cores busy."""
+"""Number of threads for an update on the CPU: one per core, or only one if other programs keep the cores busy."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -7,9 +7,9 @@ from contextlib import contextmanager
 import torch
 
 SLOWER = 1.3
-"""The machine counts as shared if an update takes this many times the best time with the same number of threads."""
+"""Other programs seem to keep the cores busy if an update takes more than this factor times the best time so far."""
 LOOK_AGAIN = 20
-"""Number of updates with one thread, after which all threads are tried again."""
+"""After this number of updates with one thread, all threads are tried again."""
 
 
 class UpdateThreads:
@@ -30,8 +30,8 @@ class UpdateThreads:
 
     @contextmanager
     def use(self) -> Iterator[None]:
-        """Run an update in the block with the chosen number of threads. Outside the block torch uses one thread, and the
-        other cores do physics.
+        """Set the chosen number of threads for the `with` block, which runs an update, and measure its time. Outside the
+        block torch uses one thread, and the other cores do physics.
         """
         before = torch.get_num_threads()
         torch.set_num_threads(self.count)

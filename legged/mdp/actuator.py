@@ -2,9 +2,9 @@
 
 The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to zero at the no-load
 speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same line).
-Friction is Coulomb's and viscous friction with the Stribeck effect, after Armstrong-Helouvry, Dupont, Canudas de Wit, "A
-survey of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994),
-smoothed at rest.
+Friction is Coulomb and viscous friction with the Stribeck effect, after Armstrong-Helouvry, Dupont, Canudas de Wit, "A survey
+of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994). Here
+friction is smoothed near zero speed.
 """
 
 import math
@@ -90,9 +90,9 @@ class Friction:
 class Actuator:
     """Actuators of N robots with D joints: delay, motor and friction between targets and joint torques.
 
-    A target is set once per control step. The target reaches the control law after the robot's delay, in physics steps. Until
-    the first target arrives, joints have the target of action 0. The torque of the law is limited to what the motor can give,
-    then friction is subtracted.
+    A target is set once per control step. The target reaches the control law after the robot's delay, a number of physics
+    steps. Until the first target arrives, joints have the target of action 0. The torque of the law is limited to what the
+    motor can give, then friction is subtracted.
     """
 
     STATE: tuple[str, ...] = ("targets", "delay")
@@ -166,7 +166,7 @@ class Actuator:
 
     @property
     def past(self) -> Tensor:
-        """State of the network, under its name in saved states."""
+        """State of the network. Saved states hold it under the name `past`."""
         assert self.network is not None
         return self.network.state
 
@@ -245,8 +245,8 @@ class Actuator:
 
 
 def modelled_joints(robot: Robot, cfg: ActuatorConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
-    """Return the indices of the joints that have the motor model, and the network if one is given (control.actuator.joints).
-    `where` turns a dotted path into the beginning of an error message.
+    """Return the indices of the joints in control.actuator.joints, or of all joints if it is empty. The motor model and the
+    network apply to these joints. `where` turns a dotted path into the beginning of an error message.
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -308,8 +308,8 @@ def friction_numbers(
 
 
 def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np.ndarray) -> np.ndarray:
-    """Return a number for each joint, (D,). The keys of `table` are patterns: the longest one that a joint's name contains
-    gives the number. If a name contains none, `otherwise` (D,) gives it.
+    """Return a number for each joint, (D,). The keys of `table` are patterns. The longest pattern in a joint's name decides.
+    A joint whose name contains no pattern gets its number from `otherwise` (D,).
 
     Raises:
         ConfigError: a pattern matches no joint.
@@ -335,17 +335,17 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
         laws = robot.each(cfg.control_type, where("control.control_type"))
         for law in laws[list(modelled_joints(robot, actuator, where))]:
             if law != "P":
-                raise ConfigError(f"{path}: a learned actuator takes joint angles (control_type P), not {law}")
+                raise ConfigError(f"{path}: a learned actuator needs control_type P (joint angles), not {law}")
         NetworkWeights.load(actuator.network, path).steps_between(sim_dt, path)
 
 
 def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
-    """Check that stall_torque and no_load_speed, which ideal motors ignore, are not given for ideal motors by mistake. If a
-    file gives these numbers, the command line may set control.actuator.model to `ideal`, to try motors without them.
+    """Check that stall_torque and no_load_speed are not given for ideal motors by mistake. Ideal motors ignore these numbers.
+    If a file gives them, the command line may still set control.actuator.model to `ideal`.
 
     Raises:
-        ConfigError: the numbers are given but the motor model is not set, or the command line gives the numbers but does not
-            set the model too.
+        ConfigError: the numbers are given but no motor model is set, or the command line gives the numbers but the model is
+            set only in a file.
     """
     path, told = "control.actuator.model", origins.of("control.actuator.model")
     for name in ("stall_torque", "no_load_speed"):
@@ -354,8 +354,8 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
         where = f"control.actuator.{name}"
         if told == "the default" or (origins.of(where) == "command line" and told != "command line"):
             raise ConfigError(
-                f"{origins.where(where)}: only motors with a torque-speed line use it, but these motors are ideal: "
-                f"set {path} to dc_motor, or to ideal if that is meant"
+                f"{origins.where(where)}: only motors with a torque-speed line use it, but these motors are ideal; "
+                f"set {path} to dc_motor, or to ideal to ignore it"
             )
 
 
@@ -375,7 +375,7 @@ def check_slowest(
         raise ConfigError(
             f"{where('domain_rand.ranges.velocity_limit')}: its lowest value, {lowest:g}, makes the torque-speed line of "
             f"'{robot.joint_names[i]}' so steep that in physics steps of {sim_dt:g} s the motor would push and brake "
-            f"in turn (control.actuator.model dc_motor); must be at least {least:g}"
+            f"in turn (control.actuator.model dc_motor); the lowest value must be at least {least:g}"
         )
 
 
@@ -389,8 +389,8 @@ def _line_gains(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
 def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: float, where: Callable[[str], str]) -> None:
     """Check that no torque-speed line is too steep for the physics step.
 
-    With a gain above LARGEST_GAIN, a joint in the air overshoots the no-load speed in a physics step by more than it was off
-    before. The motor then pushes and brakes in turn.
+    With a gain above LARGEST_GAIN, the speed of a joint in the air overshoots the no-load speed in each physics step, and is
+    farther from it than before. The motor then pushes and brakes in turn.
 
     Raises:
         ConfigError: a line is too steep.
@@ -403,7 +403,7 @@ def _check_line(robot: Robot, stall: np.ndarray, speed: np.ndarray, sim_dt: floa
     rotor = robot.armature[i] + stall[i] * sim_dt / (LARGEST_GAIN * speed[i]) - inertia
     raise ConfigError(
         f"{where('control.actuator.stall_torque')}: '{name}' turns {inertia:.2g} kg m^2 with the leg in the air, too little "
-        f"for a motor of {stall[i]:g} N m at rest and none at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would "
+        f"for a motor of {stall[i]:g} N m at rest and 0 N m at {speed[i]:g} rad/s: in physics steps of {sim_dt:g} s it would "
         f"push and brake in turn. Give its rotor's inertia (control.actuator.armature, {1.06 * rotor:.2g} kg m^2 or more), "
-        f"or make sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # 1.06 and 0.94 outweigh rounding
+        f"or make sim.dt {0.94 * sim_dt * LARGEST_GAIN / gain[i]:.2g} s or less"  # 1.06 and 0.94 allow for rounding
     )

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 KINDS = ("mlp", "lstm")
 FORMAT = 1
-"""Version of the file's layout."""
+"""Version of the layout of a learned actuator's file."""
 WIDEST, DEEPEST = 1024, 16
-"""Largest number of units in a layer, and of layers."""
+"""Largest number of units in a layer, and largest number of layers."""
 TOLERANCE = 1e-3
 """Largest deviation of the time between samples from a whole number of physics steps, in physics steps."""
 
@@ -70,7 +70,7 @@ class NetworkWeights:
         except OSError as error:
             raise ConfigError(f"{where}: {path}: {error.strerror or 'not a file of a learned actuator (.npz)'}") from error
         except Exception as error:  # a damaged file raises errors of zipfile, numpy and zlib
-            raise ConfigError(f"{where}: {path}: not a file of a learned actuator (.npz), as fit_actuator writes") from error
+            raise ConfigError(f"{where}: {path}: not a file of `legged fit-actuator` (.npz)") from error
         try:
             return cls._of(arrays)
         except (KeyError, ValueError, TypeError) as error:
@@ -132,8 +132,8 @@ class NetworkWeights:
         if steps < 1 or abs(self.dt / sim_dt - steps) > TOLERANCE or (self.kind == "lstm" and steps != 1):
             allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} divided by a whole number"
             raise ConfigError(
-                f"{where}: was trained on samples {self.dt:g} s apart, which does not fit physics steps of sim.dt={sim_dt:g};"
-                f" sim.dt must be {allowed} (fit_actuator --dt sets the time between samples)"
+                f"{where}: the network was trained on samples {self.dt:g} s apart. They do not fit physics steps of"
+                f" sim.dt={sim_dt:g}; sim.dt must be {allowed} (`legged fit-actuator --dt` sets the time between samples)"
             )
         return steps
 
@@ -181,7 +181,7 @@ class ActuatorNetwork:
 
     def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
         """Return the torques (N, D) [N m] of this physics step. `error` (N, D) is the target minus the joint angle [rad],
-        `dof_vel` (N, D) the joint velocity [rad/s].
+        and `dof_vel` (N, D) the joint velocity [rad/s].
         """
         if self._kernels is not None:
             net = (self._weights, self._widths, self.state, self._scratch, self._found)
@@ -198,7 +198,7 @@ class ActuatorNetwork:
             self.state[:, 1:].copy_(self.state[:, :-1].clone())
         torch.mul(error, self._position, out=self.state[:, 0, 0])
         torch.mul(dof_vel, self._velocity, out=self.state[:, 0, 1])
-        # Rows are the errors of all samples, then the velocities, newest first. Columns are the joints of all robots.
+        # Rows of x are the errors of all samples, then the velocities, newest first. Columns are the joints of all robots.
         x = self.state[:, :: self._every].permute(2, 1, 0, 3).reshape(2 * self._samples, self._rows)
         for layer in self._layers[:-1]:
             x = torch.nn.functional.softsign(torch.addmm(layer["bias"].unsqueeze(1), layer["weight"], x))

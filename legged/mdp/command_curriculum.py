@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 class CommandCurriculum:
     """Curriculum that widens the range of each command axis (vx, vy, yaw rate) separately, while robots follow that axis.
 
-    Each axis is judged once per window, by the robots whose command exceeds half of the current range. The measure is their
-    mean velocity in the commanded direction, as a share of the commanded velocity. The sway of a gait and exploration average
-    out in this share, but not in a tracking error. A robot that stands still scores 0, however narrow the range is.
+    Each axis is judged once per window, from the robots whose command exceeds half of the current range. The measure is their
+    mean velocity in the commanded direction, as a share of the commanded velocity. In this share, a gait's sway and the
+    noise of exploration average out. In a tracking error they would not. A robot that stands still scores 0 in any range.
     """
 
     STATE = ("share", "_sums", "_steps")
@@ -72,7 +72,7 @@ class CommandCurriculum:
         self._window.masked_fill_(due, 0.0)
 
     def metrics(self) -> dict[str, Tensor]:
-        """Return the largest command that each axis allows now, by name in TensorBoard, as new 0-dimensional tensors."""
+        """Return the largest allowed command of each axis as a new 0-dimensional tensor, under its name in TensorBoard."""
         if not self.cfg.enabled:
             return {}
         names = ("command_vx", "command_vy", "command_yaw")

@@ -34,8 +34,8 @@ class Commands:
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
     ) -> None:
-        """Set all commands to zero. The first update samples them. `dt` is the control step [s]. Random numbers come from the
-        pool `numbers`.
+        """Set all commands to zero. The first `update` replaces them. `dt` is the control step [s]. Random numbers come from
+        the pool `numbers`.
         """
         self.cfg, self.dt, self._kernels = cfg, dt, kernels
         ranges = (cfg.ranges.lin_vel_x, cfg.ranges.lin_vel_y, cfg.ranges.ang_vel_yaw)
@@ -68,7 +68,7 @@ class Commands:
         self._kept = torch.cat([kept, torch.ones(5, 1)], dim=1).to(device)  # all kinds keep the heading
 
     def draw(self) -> None:
-        """Sample a new command for every robot from the drawn numbers. `update` gives it to the robots that are due."""
+        """Sample a new command for every robot from the pool's numbers. `update` gives it to robots that need a new one."""
         low, high = self.ranges[:, 0], self.ranges[:, 1]
         torch.addcmul(low, high - low, self._velocity.values, out=self._sample[:, :3])
         self._sample[:, 3:].copy_(self._heading.values)
@@ -86,7 +86,7 @@ class Commands:
             self._update_in_one_launch(reset, base_quat)
             return
         self.time_left.sub_(self.dt)
-        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # due and not held
+        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # for masks, a > b means a and not b
         masked_set_(self.commands, due, self._sample)
         masked_set_(self.standing, due, self._sample_standing)
         masked_set_(self.time_left, due, self.cfg.resampling_time_s)

@@ -41,7 +41,7 @@ class FeetContacts:
     ) -> None:
         """Clear all times and contacts. `dt` is the control step [s]; `force` is the threshold of a contact [N]."""
         self.dt, self._kernels, self.force = dt, kernels, force
-        # These are views of two tensors, so that a reset takes two launches.
+        # The five masks and times are views of two tensors, so that a reset takes only two kernel launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
         self._times = torch.zeros(num_envs, 2, num_feet, device=device)
         self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)

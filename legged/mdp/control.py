@@ -24,7 +24,7 @@ class Control:
     """Explicit control laws, evaluated at every physics step and clipped to the motors' effort limits.
 
     P: stiffness * (action_scale * action + default - q) - damping * dq
-    V: stiffness * (action_scale * action - dq) - damping * ddq, with ddq over one physics step
+    V: stiffness * (action_scale * action - dq) - damping * ddq, with the mean acceleration ddq of the last physics step
     T: action_scale * action
 
     Each joint has one of these laws. Of the D joints, A have an action. The others are held: the law takes 0 as their action.

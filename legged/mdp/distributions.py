@@ -17,8 +17,8 @@ KINDS = ("uniform", "log_uniform", "gaussian")
 
 
 def standard_deviation(draw: DrawConfig) -> float:
-    """Return the standard deviation of a normal distribution before it is cut off at the ends of its range: `draw.std`, or a
-    quarter of the range's width if that is 0.
+    """Return `draw.std`, or a quarter of the range's width if `draw.std` is 0. This is the standard deviation of a normal
+    distribution before its tails outside the range are cut off.
     """
     return draw.std or 0.25 * (draw.range[1] - draw.range[0])
 
@@ -35,7 +35,7 @@ class Distributions:
         within: bool = True,
     ) -> None:
         """Configure the columns. A range with `grow` widens over training, starting from the column's value in `neutral`
-        (V,). With `within`, it starts from the nearest end of the range if the neutral value is outside.
+        (V,). With `within`, a neutral value outside the range is replaced by the nearest end.
         `steps_per_iteration` is the number of control steps in a training iteration.
         """
         self._order = sorted(range(len(columns)), key=lambda i: KINDS.index(columns[i].distribution))
@@ -88,7 +88,7 @@ class Distributions:
         return numbers.between(self.low, self.high, len(self.low))
 
     def at_once(self, count: int) -> Tensor:
-        """Draw (count, V) numbers outside a step. Ranges that widen have their initial width."""
+        """Draw (count, V) numbers at once, without the pool of a control step. Ranges that widen have their initial width."""
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
 
@@ -112,7 +112,7 @@ class Distributions:
         if self._back is not None:
             drawn = drawn.index_select(1, self._back)
         if any(self._counts[1:]):
-            drawn = torch.clamp(drawn, self._least, self._most)  # rounding may exceed the range slightly
+            drawn = torch.clamp(drawn, self._least, self._most)  # rounding can carry a number slightly out of the range
         if self._pace is None:
             return drawn
         share = torch.addcmul(self._pace[1], self._pace[0], steps).clamp_(0.0, 1.0)

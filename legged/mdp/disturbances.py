@@ -16,8 +16,8 @@ TURNS = ("roll", "pitch", "yaw")
 def _columns(
     cfg: KickConfig | ForceConfig, names: tuple[str, ...], times: tuple[str, ...]
 ) -> tuple[list[DrawConfig], list[float]]:
-    """Return the distribution of each random column of a disturbance, and the value that each range starts from. The columns
-    are first its components `names`, whose ranges may widen from 0, then its `times`, whose ranges are constant.
+    """Return the distribution of each random column of a disturbance, and the value that each range starts from. The first
+    columns are the components `names`, whose ranges may widen from 0. The last columns are `times`, with constant ranges.
     """
     columns = [DrawConfig(range=getattr(cfg, name), grow=cfg.grow) for name in names]
     columns += [DrawConfig(range=getattr(cfg, name)) for name in times]
@@ -71,7 +71,8 @@ class Forces:
         """Distribution of each random column, and the value that its range starts from."""
         self._dt, self.body = dt, body
         self.left, self.force = left, force
-        """(N, 2) time until the current push ends and until the next one begins [s]; (N, 3) force now, world frame [N]."""
+        """`left` (N, 2): time until the current push ends, and time until the next push begins [s]. `force` (N, 3): force of
+        the current push in the world frame [N], or 0."""
         left[:, 1] = uniform(0.0, cfg.interval_s[1], (len(left),), left.device)
 
     def take(self, drawn: Tensor) -> None:
@@ -79,7 +80,7 @@ class Forces:
         self.drawn = drawn
 
     def act(self, physics: Physics, mask: Tensor) -> None:
-        """Begin pushes that are due, and end those whose time is over and all those of robots outside `mask` (N,)."""
+        """Begin the pushes that are due. End the pushes whose time is over, and every push on a robot outside `mask` (N,)."""
         assert physics.forces is not None
         self.left.sub_(self._dt)
         passed = self.left <= 0.5 * self._dt
@@ -92,7 +93,7 @@ class Forces:
 
 
 class Disturbances:
-    """All kicks and forces of a task. They use columns of the same tensors, so that one launch handles all of them."""
+    """All kicks and forces of a task. Their values are columns of common tensors, so that one kernel launch handles all."""
 
     def __init__(
         self,
@@ -102,8 +103,9 @@ class Disturbances:
         steps_per_iteration: int,
         numbers: RandomPool,
     ) -> None:
-        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]. `steps_per_iteration` is the number of
-        control steps in a training iteration, because `grow` counts iterations. Random numbers come from the pool `numbers`.
+        """Build the kicks and forces that `cfg` names. `dt` is the control step [s]. `steps_per_iteration`, the number of
+        control steps in a training iteration, converts `grow` [iterations] to control steps. Random numbers come from the
+        pool `numbers`.
         """
         self._dt, self._kernels = dt, physics.kernels
         num_envs, device = numbers.num_envs, numbers.device
@@ -181,11 +183,11 @@ class Disturbances:
             force.force.zero_()
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the number of steps for which ranges have widened; {} if there are no disturbances."""
+        """Return the number of control steps since training began; {} if there are no disturbances."""
         return {"steps": self.steps.clone()} if self._all else {}
 
     def load_progress(self, progress: dict[str, Tensor]) -> None:
-        """Continue from the number of steps that `progress` returned."""
+        """Continue from the number of control steps in `progress`."""
         if "steps" in progress and self._all:
             self.steps.copy_(progress["steps"])
 

@@ -21,8 +21,8 @@ def is_exact(cfg: HeightMapConfig) -> bool:
 
 
 class HeightMapErrors:
-    """Height maps of N robots, with errors: a map is displaced from the ground, the displacement drifts, and some of its P
-    points are unknown.
+    """Height maps of N robots, with errors: a map is displaced from the ground, the displacement drifts, and some of the
+    map's P points are unknown.
     """
 
     STATE = ("error", "rate", "holes")
@@ -86,6 +86,6 @@ class HeightMapErrors:
         return torch.nan_to_num(self._seen(self._scan.heights + self.error[:, 2:]), nan=0.0)
 
     def cut_holes(self, observed: Tensor) -> None:
-        """Write 0 into the observations (N, P) of unknown points."""
+        """Set the heights `observed` (N, P) to 0 at unknown points."""
         if self._holes_drawn is not None:
             observed.masked_fill_(self.holes, 0.0)

@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 
 class HeightScan:
-    """Ground heights at a grid of P points around each robot, turned with its heading. On a plane all heights are 0.
+    """Ground heights at a grid of P points around each robot. The grid turns with the robot's heading. On a plane all heights
+    are 0.
 
-    terrain.scan chooses how the cells around a point give its height (HeightMap.scan_map). The height of the ground under the
-    base is looked up in the same way.
+    The setting `terrain.scan` determines how a point's height follows from the cells around the point
+    (`HeightMap.scan_map`). The height of the ground under the base is looked up in the same way.
     """
 
     STATE: tuple[str, ...] = ()  # nothing to save: heights follow from the robots' poses
@@ -49,7 +50,7 @@ class HeightScan:
             self._origin = torch.tensor(ground.origin, dtype=torch.float32, device=device)
             self._last = [float(size - 1) for size in found.shape]
             self._map = found.flatten()
-            # These coordinates are in cells. The last point is the base's own position, so that one lookup finds all heights.
+            # Coordinates in cells. The last point is the base's position, so the same lookup finds the ground under the base.
             self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 
     def update(self, base_pos: Tensor, base_quat: Tensor) -> None:
@@ -67,7 +68,7 @@ class HeightScan:
         row, column = ((base_pos[:, :2] - self._origin) / self._cell).nan_to_num().split(1, dim=1)
         rows = row.addcmul(cos, self._x).addcmul_(sin, self._y, value=-1.0).clamp_(0.0, self._last[0]).floor_()
         columns = column.addcmul(sin, self._x).addcmul_(cos, self._y).clamp_(0.0, self._last[1]).floor_()
-        # Cell numbers are exact in float32: `check_terrain` refuses larger maps.
+        # float32 holds every cell number exactly, because `check_terrain` refuses maps with too many cells.
         cells = columns.add_(rows, alpha=self._columns).int()
         found = self._map[cells]
         self.heights.copy_(found[:, :-1])

@@ -29,8 +29,8 @@ class Metrics:
         self._functions = dict(functions)
         self.reward_names, self.termination_names = tuple(reward_names), tuple(termination_names)
         self.reward_unit, self.num_envs = reward_unit, num_envs
-        # Sums are kept by robot. `flush` adds up the robots, so that a step costs two launches for each table instead of
-        # three.
+        # A step adds to a separate sum for each robot, which costs two kernel launches per table. A sum over robots in every
+        # step would cost a third launch, so `flush` computes it.
         self._metrics = torch.zeros(len(self._functions), num_envs, device=device)
         # The rows are: steps, steps of valid robots, steps with lost contacts, episodes ended by each termination.
         self._counts = torch.zeros(3 + len(self.termination_names), num_envs, device=device)

@@ -1,4 +1,4 @@
-"""Mirror images of observations and actions: left legs are exchanged for right ones, leftward for rightward."""
+"""Mirror images of observations and actions: left and right legs are exchanged, and so are left and right directions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Literal
@@ -28,11 +28,11 @@ MirrorKind = Literal[
     "of_joints",
 ]
 """Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`: (x,
-y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`: one number for each joint; `angles`: the same without
-wheels; `actions`: one for each action; `passive`: one for each passive joint; `feet`: one for each foot; `heights`: the
-height scan; `same`: numbers that mirroring does not change; `scalar`: one such number; `sideways`: one number that is
-positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: a property of each joint whose sign mirroring
-does not change, or one number for all joints."""
+y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`: one number for each joint; `angles`: one for each joint
+that is not a wheel; `actions`: one for each action; `passive`: one for each passive joint; `feet`: one for each foot;
+`heights`: the height scan; `same`: numbers that mirroring does not change; `scalar`: one number that mirroring does not
+change; `sideways`: one number that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: one
+number for each joint, which mirroring moves to the other side but does not negate, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector, so its y component keeps its sign."""
 

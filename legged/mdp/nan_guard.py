@@ -1,7 +1,8 @@
 """Handling of numbers that are NaN, infinite or too large for any robot.
 
-One such number in a sample would reach every weight of the networks. Therefore such a reward or observation counts as 0, the
-robot's episode ends at the next step, and robots are counted by the term at fault. None of this waits for the host.
+One such number in a sample would spread to every weight of the networks. Therefore a reward or observation that is such a
+number counts as 0, and the robot's episode ends at the next step. For each term, the log shows how many robots had such a
+number. None of this waits for the host.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from torch import Tensor
 from legged.mdp.observations import ObservationTerms
 
 LARGEST = 1e10
-"""Rewards and observations beyond this count as infinite, because squares of their sums must fit a float32."""
+"""Bound on rewards and observations. Larger values are treated as infinite, because squares of sums must fit a float32."""
 LARGEST_STATE = 1e4
 """Bound on positions [m], velocities [m/s], angles [rad] and rates [rad/s]. Beyond it the physics has diverged."""
 
@@ -25,8 +26,8 @@ class NanGuard:
     STATE = ("sound",)
 
     def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
-        """Watch the reward terms named `rewards`, in the order of the rows in `check_rewards`, and the terms of
-        `observations`.
+        """Watch the reward terms named `rewards` and the terms of `observations`. The rows of `check_rewards` have the order
+        of `rewards`.
         """
         self.outputs_finite = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
@@ -38,7 +39,7 @@ class NanGuard:
         self._now = torch.zeros(2, num_envs, dtype=torch.bool, device=device)  # rows: physics, action
         self._seen = torch.zeros_like(self._now)
         self._rewards_finite = torch.ones(len(rewards), num_envs, dtype=torch.bool, device=device)
-        # Largest absolute value of each observation column, recorded in two launches per step. `flush` counts the robots.
+        # Largest absolute value (N, width) of each observation since the last `flush`. A step updates it by two launches.
         self._largest = torch.zeros_like(observations.values)
 
     def check_state(self, in_bounds: Tensor, clipped_actions: Tensor) -> None:
@@ -47,7 +48,7 @@ class NanGuard:
         """
         physics, action = self._now
         torch.any(clipped_actions != clipped_actions, dim=1, out=action)
-        torch.eq(in_bounds, action, out=physics)  # out of bounds with finite actions: the physics is at fault
+        torch.eq(in_bounds, action, out=physics)  # True if out of bounds although actions are finite
         self._seen.logical_or_(self._now)
 
     def check_rewards(self, rewards_finite: Tensor, valid: Tensor) -> None:

@@ -46,8 +46,8 @@ class ObservationTerms:
     def evaluate(self, begun: Tensor | None = None, again: bool = False) -> None:
         """Evaluate all terms into `raw` and `values`, then update `errors` by a control step.
 
-        Robots of `begun` (N,) have new episodes. With `again`, `errors` repeat the measurement of the same step. Without
-        `begun`, `errors` show the measurement that the step would give, but keep their state.
+        Robots of `begun` (N,) have new episodes. With `again`, `errors` repeats the measurement of the same step. Without
+        `begun`, `errors` shows the measurement that a step ending now would give, and keeps its state.
 
         Raises:
             TermError: a term fails.
@@ -114,7 +114,7 @@ class ObservationGroup:
         self.buffer = self._steps.flatten(1)
         """(N, history * width) input of the network."""
         self._now = self._steps[:, -1]
-        # Adjacent terms are read as a slice; others are picked column by column.
+        # If the terms are side by side in `source.values`, one slice reads them. Otherwise columns are picked by index.
         together = columns == list(range(columns[0], columns[0] + start))
         self._values = source.values[:, columns[0] : columns[0] + start] if together else source.values
         self._columns = None if together else torch.tensor(columns, device=device)

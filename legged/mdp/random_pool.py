@@ -20,8 +20,8 @@ class Slice:
 
 
 class RandomPool:
-    """Uniform random numbers of N environments. Two launches draw all of them. If each part drew its own numbers, each would
-    take two launches. Parts reserve their columns while the task is built.
+    """Uniform random numbers of N environments. Two kernel launches draw the numbers for all parts of a task; separate draws
+    would take two launches for each part. The parts reserve their columns while the task is built.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:

@@ -35,7 +35,7 @@ class Randomization:
         to its distribution.
         """
         self.draws = {name: draw_of(entry) for name, entry in ranges.items()}
-        """Field -> its distribution and the moments of its draws."""
+        """Field -> its distribution, and when new values are drawn."""
         self.columns = {name: slice(k, k + 1) for k, name in enumerate(ranges)}
         """Field -> its columns in `drawn`."""
         self.drawn = torch.zeros(num_envs, len(ranges), device=device)
@@ -107,7 +107,8 @@ class Randomization:
             if field in MODEL_FIELDS and field not in self.chosen_fields:
                 physics.randomize(field, values)
         if self.chosen_fields:
-            if self._given is None or not torch.equal(self._given, self.variants):  # avoids slow derivations of constants
+            # `set_variants` derives constants, which is slow, so it is called only if the variants have changed.
+            if self._given is None or not torch.equal(self._given, self.variants):
                 widths = [self.columns[name].stop - self.columns[name].start for name in self.chosen_fields]
                 physics.set_variants(dict(zip(self.chosen_fields, self.variants.split(widths, dim=1), strict=True)))
                 self._given = self.variants.clone()
@@ -126,7 +127,8 @@ class Randomization:
         self._even = self._own.ask(numbers) if self._own is not None else None
         self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
         self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
-        # New values have the order of `own`, then of the chosen fields. Moment 0 means never, 1 resets, from 2 on intervals.
+        # `place` is each column's index among new values, which are in `order`. `moment` says when a column gets new values:
+        # 0 means never, 1 means at resets, and 2 + k means every `intervals[k]` seconds.
         intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
         order, place, moment = [*own, *self.chosen_fields], [], []
         starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))
@@ -178,8 +180,8 @@ class Randomization:
         torch.index_select(torch.cat(parts, dim=1), 1, self._place, out=self._fresh)
 
     def redraw(self, reset: Tensor) -> None:
-        """Give the values that `draw` has drawn to the worlds of `reset` (N,), whose episodes begin, and to worlds whose
-        interval has elapsed. This runs within a step.
+        """Copy into `drawn` the values that `draw` drew, for worlds of `reset` (N,), whose episodes begin, and for worlds
+        whose interval has elapsed. This runs within a step.
         """
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
@@ -194,14 +196,14 @@ class Randomization:
                 masked_set_(self.chosen, self._chosen_due, self._new_chosen)
 
     def rewrite(self, physics: Physics) -> None:
-        """Write the values that `redraw` has changed into the physics, within a step."""
+        """Write into the physics the values that `redraw` has changed. This runs within a step."""
         if self.chosen_fields:
             physics.choose_variants(self._chosen_due, self.chosen)
         if self._of_model:
             physics.redraw(self._any_due)
 
     def _find_moments(self, reset: Tensor) -> None:
-        """Mark in `_due` for each world which moments (resets, intervals) have come, and count the step."""
+        """Mark in `_due` the worlds of `reset` (N,) and the worlds whose interval has elapsed. Add 1 to `steps`."""
         self._due[:, 1].copy_(reset)
         if len(self._interval):
             self.steps_left.sub_(1.0)
@@ -211,11 +213,11 @@ class Randomization:
         self.steps.add_(1.0)
 
     def progress(self) -> dict[str, Tensor]:
-        """Return the number of steps for which ranges have widened; {} if no range widens."""
+        """Return the number of control steps since training began; {} if no range widens."""
         return {"steps": self.steps.clone()} if any(draw.grow[1] > 0.0 for draw in self.draws.values()) else {}
 
     def load_progress(self, progress: Mapping[str, Tensor]) -> None:
-        """Continue from the number of steps that `progress` returned."""
+        """Continue from the number of control steps in `progress`."""
         if "steps" in progress and self.redrawn:
             self.steps.copy_(progress["steps"])
 

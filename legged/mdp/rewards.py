@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 
 class Rewards:
-    """Reward of a step: the sum of scale * dt * term. `termination` is added after the clip at zero, as in legged_gym."""
+    """Reward of a step: the sum of scale * dt * term. If the sum is clipped at zero, the term `termination` is added after
+    the clip, as in legged_gym.
+    """
 
     STATE = ("sums",)
 

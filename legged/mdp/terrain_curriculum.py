@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 class TerrainCurriculum:
     """Tile of each robot. The column of the tile (a terrain type) is fixed; the row (a level) changes with success.
 
-    The rule is legged_gym's. A robot that got further than half a tile from the middle of its tile moves up a level. A robot
-    that got less than half as far as its command asked moves down. From the top level a robot goes to a random one.
-    Therefore, with ten rows, a policy that is always promoted has a mean level of 6.0, not 9.
+    The rule is legged_gym's. A robot moves up a level if it ends further than half a tile from the middle of its tile. It
+    moves down if it got less than half as far as its command asked. A robot that moves up from the top level goes to a random
+    level. Therefore, with ten rows, a policy that is always promoted has a mean level of 6.0, not 9.
     """
 
     STATE = ("levels", "columns", "origins", "_sums")
@@ -112,8 +112,8 @@ class TerrainCurriculum:
         return {"levels": self.levels.clone()}
 
     def load_progress(self, state: dict[str, Tensor]) -> None:
-        """Continue from saved levels. With another number of robots, levels are drawn from the saved ones. Reset the robots
-        afterwards, because until then they stand on their old tiles.
+        """Continue from saved levels. If the number of robots has changed, levels are drawn from the saved levels. Reset the
+        robots afterwards, because until then they stand on their old tiles.
         """
         saved = state["levels"].to(self.levels.device).clamp(max=self.rows - 1)
         if len(saved) != len(self.levels):

@@ -1,1 +1,1 @@
-"""Migration of configurations of legged_gym and its forks to tasks. A child process runs the configurations' files."""
+"""Migration of configurations of legged_gym and its forks to tasks of this package. A child process runs their files."""

@@ -1,7 +1,7 @@
-"""Program that runs a fork's configuration and prints its values, methods and terrain types as JSON.
+"""Program that runs the configuration of a legged_gym fork and prints the values, methods and terrain types as JSON.
 
-`reading.py` starts it as a child process. It imports nothing of this package. Stand-ins replace modules that are not
-installed, and always those in `REPLACED`. Any use of a stand-in gives another stand-in.
+`reading.py` starts this program as a child process. The program imports nothing of this package. Stand-ins replace modules
+that are not installed, and the modules in `REPLACED` in any case. Any use of a stand-in gives another stand-in.
 """
 
 import abc
@@ -44,7 +44,7 @@ INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<f
 READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
 """Name -> pattern that is searched for in the text of a method."""
 CUT = "(cut)"
-"""Name of a stand-in for some columns of joined parts."""
+"""Name of a stand-in for columns of a `torch.cat` result. It is not known which of the joined parts they belong to."""
 CALLS: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 """Calls of stand-ins: name, and arguments."""
 KNOWN: dict[str, Any] = {}
@@ -54,8 +54,8 @@ USED: dict[str, None] = {}
 
 
 class StandIn:
-    """Object of a module that is not installed, or a value computed from one. It knows the names and numbers that it was
-    computed from, and the parts that `torch.cat` joined.
+    """Stand-in for an object of a module that is not installed, or for a value computed from such objects. It records the
+    names and numbers that it was computed from, and the parts that `torch.cat` joined.
     """
 
     def __init__(self, *names: str, parts: "list[StandIn] | None" = None) -> None:
@@ -179,7 +179,9 @@ def define(name: str, data: dict[str, Any], parent: Any) -> type:
 
 
 def load(file: Path) -> tuple[types.ModuleType, Path]:
-    """Import the file as a module of its package. Return the module, and the folder of its package or else of the file."""
+    """Import the file as a module of its package. Return the module and the package's folder. If the file is outside any
+    package, return the file's folder instead.
+    """
     gap, root, own = 0, file.parent, ALONE
     for folder in file.parents:
         gap += 1
@@ -209,8 +211,8 @@ def objects() -> list[Any]:
 
 
 def fork_classes(attribute: str) -> list[type]:
-    """Return the user's classes that have an attribute whose name begins with `attribute`. A class from which another one
-    of them is derived is left out.
+    """Return the user's classes that have an attribute whose name begins with `attribute`. A class is left out if another of
+    these classes is derived from it.
     """
     classes = dict.fromkeys(value for value in objects() if isinstance(value, type) and _is_of_fork(value.__module__))
     having = [cls for cls in classes if any(name.startswith(attribute) for name in dir(cls))]
@@ -237,8 +239,8 @@ def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str,
 
 
 def configurations(module: types.ModuleType) -> dict[str, type]:
-    """Return the environment configurations that a module defines. If it only imports a class, each
-    function `config_*` of the module turns this class into a configuration.
+    """Return the environment configurations that a module defines. If the module defines none and imports only one, each
+    function `config_*` of the module changes the imported class into a configuration.
     """
     learners = with_sections(module, LEARNER_SECTIONS)
     classes = {name: value for name, value in with_sections(module, SECTIONS).items() if name not in learners}
@@ -253,7 +255,7 @@ def configurations(module: types.ModuleType) -> dict[str, type]:
 
 
 def learner_of(module: types.ModuleType, name: str) -> Any:
-    """Return the learner's configuration whose name fits the environment's, or the only one."""
+    """Return the learner's configuration whose name fits `name`, else the only one in the module, else None."""
     learners = {k: v for k, v in with_sections(module, LEARNER_SECTIONS).items() if v.__module__ == module.__name__}
     for other in (f"{name}PPO", name.replace("Cfg", "CfgPPO"), name.replace("Config", "ConfigPPO")):
         if other in learners:
@@ -297,7 +299,7 @@ def plain(value: Any) -> Any:
     """Return a value as JSON represents it: numbers, texts, lists and tables.
 
     Raises:
-        NotPlain: JSON cannot represent the value; the text gives the reason.
+        NotPlain: JSON cannot represent the value. The error's text gives the reason.
     """
 
     def other(item: Any) -> Any:
@@ -315,7 +317,7 @@ def plain(value: Any) -> Any:
         raise NotPlain("is too large") from None
     if len(text) > LONGEST:
         raise NotPlain("is too large")
-    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # turns -0.0 into 0.0
+    return json.loads(text, parse_float=lambda number: float(number) + 0.0)  # adding 0.0 turns -0.0 into 0.0
 
 
 def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict[str, Any]:
@@ -342,8 +344,8 @@ def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict
 
 
 def method(function: Any) -> dict[str, Any]:
-    """Return place and digest of a method, and the names of `READS` that it reads. The digest does not depend on layout and
-    docstring, or on whether attributes are read from `self` or, as in a container of rewards, from `self.env`.
+    """Return place and digest of a method, and the names of `READS` that it reads. Layout and docstring do not affect the
+    digest. `self.env.x`, as in a container of rewards, gives the same digest as `self.x`.
     """
     code = inspect.unwrap(function).__code__
     node = nodes_of(code.co_filename).get(code.co_qualname, ast.parse(""))
@@ -382,8 +384,8 @@ def environment_classes(task_class: Any, root: Path) -> list[type]:
 
 
 def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> None:
-    """Run a function. Its arguments are the `values` of the same names; stand-ins replace missing ones. `others` replace its
-    globals of the same names.
+    """Run a function. `values` has the arguments by name; stand-ins replace missing arguments. `others` has objects that
+    replace globals of the function, by name.
     """
     run = types.FunctionType(function.__code__, function.__globals__ | others, None, None, function.__closure__)
     CALLS.clear()
@@ -392,8 +394,8 @@ def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> Non
 
 def terrains(config: Any) -> list[Any] | None:
     """Return an item for each entry of terrain_proportions; None if the fork has no make_terrain. An item has a pair for each
-    half of the entry's columns: the names of the terrain functions that make_terrain calls, joined by " + ", and the sign of
-    the first one's slope or step height. If make_terrain fails, None takes the place of the pair.
+    half of the entry's columns. A pair is the names of the terrain functions that make_terrain calls, joined by " + ", and
+    the sign of the first function's slope or step height. If make_terrain fails, None takes the place of the pair.
     """
     shares, makers = getattr(config, "terrain_proportions", None), fork_classes("make_terrain")
     if not makers or not isinstance(shares, list | tuple):
@@ -424,8 +426,8 @@ def sign(args: tuple[Any, ...], options: dict[str, Any]) -> int:
 
 
 def observations(cls: type, config: Any) -> list[Any]:
-    """Return two lists of the parts that compute_observations joins: for the policy and for the value function. A part is the
-    list of names and numbers from which it is computed. A list of parts is None if they can't be determined.
+    """Return the parts that compute_observations joins: a list for the policy and a list for the value function. Each part
+    is given as the names and numbers in its formula. A list is None if its parts cannot be determined.
     """
     self = StandIn("self")
     vars(self).update(cfg=config)

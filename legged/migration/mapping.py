@@ -17,14 +17,14 @@ from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
 
 LONGEST_HISTORY = 20
-"""Longest observation history that is tried [steps]."""
+"""Longest observation history that `_by_number` tries [steps]."""
 SIGMA = "tracking_sigma"
 OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 """Methods of legged_gym that use commands[:, 3], the heading."""
 
 
 def map_settings(fork: Fork) -> Translation:
-    """Return the task that the settings and the methods of a fork become."""
+    """Translate the settings and methods of a fork of legged_gym into a task."""
     result = Translation(_moved(fork.settings))
     for theirs, ours in tables.SAME.items():
         if theirs in tables.ABSENT and theirs not in result.theirs:
@@ -86,7 +86,7 @@ def _terrain(result: Translation, fork: Fork) -> None:
 
 
 def _shares(proportions: list[float], functions: list[Any] | None) -> dict[str, float]:
-    """Return terrain type -> share. `functions`, or else legged_gym's order, give the types for each of `proportions`."""
+    """Return terrain type -> share. `functions` gives the types of each of `proportions`; None means legged_gym's types."""
     shares: dict[str, float] = {}
     kinds = tables.TERRAINS if functions is None else functions
     for i, share in enumerate(proportions):
@@ -115,7 +115,7 @@ def _fits(result: Translation, name: str) -> bool:
 
 
 def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[dict[str, float], list[str]]:
-    """Return the shares without types that would get less than one column, and these types. Other types get their shares."""
+    """Give the shares of types with less than one column to other types. Return the new shares and the removed types."""
     columns, out = int(result.settings.get("terrain.num_cols", DEFAULTS["terrain"]["num_cols"])), []
     while len(shares) > 1 and min(shares.values()) * columns < 1.0 - 1e-9:
         name = min(shares, key=lambda key: shares[key])
@@ -130,7 +130,7 @@ def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[di
 
 
 def _commands(result: Translation) -> None:
-    """Map the command curriculum: legged_gym widens vx by 0.5 m/s up to max_curriculum."""
+    """Map the command curriculum. legged_gym widens the range of vx by 0.5 m/s at a time, up to max_curriculum."""
     limit = result.get("commands.max_curriculum", 0.0)
     speeds = result.get("commands.ranges.lin_vel_x", [])
     if result.get("commands.curriculum", False) is not True or len(speeds) != 2:
@@ -147,7 +147,7 @@ def _commands(result: Translation) -> None:
 
 
 def _contacts(result: Translation) -> None:
-    """Map self-collisions, and the friction range to its mean with the ground's friction, because PhysX averages both."""
+    """Map self-collisions and friction. The ends of the friction range are averaged with the ground's, as in PhysX."""
     own = result.get("domain_rand.friction_range", [])
     ground = result.get("terrain.static_friction", 1.0)
     if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
@@ -163,8 +163,8 @@ def _contacts(result: Translation) -> None:
 
 
 def _rewards(result: Translation, fork: Fork) -> None:
-    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale; note which methods the user
-    has to paste for them.
+    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale. A note lists the methods that
+    the user has to paste for them.
     """
     known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
     sigma, mapped, paste = "", set(), []
@@ -175,7 +175,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
             continue
         methods = fork.methods.get(f"_reward_{name}", [])
         own = next((method for method in methods if not method.original), None)
-        # legged_gym has a scale feet_stumble for the method _reward_stumble; since the names differ, it has no effect there.
+        # legged_gym's scale feet_stumble is meant for its method _reward_stumble, but has no effect because the names differ.
         ours = "stumble" if name == "feet_stumble" and not fork.methods else name
         then = f"rewards.scales.{name}: {scale:g}"
         if fork.methods and not methods:
@@ -201,7 +201,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
 
 
 def _observations(result: Translation, fork: Fork) -> None:
-    """Map the observations: from the parts that compute_observations joins or, without a class, from their number."""
+    """Map the observations from the parts that compute_observations joins. If no class was found, guess from their number."""
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
     history, one = (result.get(result.has(*names) or names[0]) for names in (tables.HISTORY, tables.ONE_STEP))
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:
@@ -246,7 +246,7 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
 
 
 def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
-    """Return those of legged_gym's lists of terms, and the number of steps, that give `number` numbers; else None and 1."""
+    """Return legged_gym's terms and the number of steps that give `number` numbers in total; None and 1 if none fit."""
     joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if result.get("terrain.measure_heights", False):
@@ -315,7 +315,7 @@ def _delay(result: Translation) -> None:
 
 
 def _hooks(result: Translation, fork: Fork) -> None:
-    """Note the fork's own methods that no setting replaces, and methods that read commands with another meaning here."""
+    """Note the fork's own methods that no setting replaces, and those that read the fourth or a later column of commands."""
     own = {name: method for name, methods in fork.methods.items() for method in methods if not method.original}
     hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:
@@ -323,7 +323,7 @@ def _hooks(result: Translation, fork: Fork) -> None:
     fourth = [name for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING]
     readers = [f"{name} ({own[name].place})" for name in fourth]
     if readers:
-        result.note("commands", f"commands[:, 3] is the heading here, and the last command; check {', '.join(readers)}")
+        result.note("commands", f"commands[:, 3] is the heading here, and no column follows it; check {', '.join(readers)}")
 
 
 def _rest(result: Translation) -> None:

@@ -58,7 +58,7 @@ class Fork:
     task: str
     """Name of the task."""
     described: str
-    """Names of the classes."""
+    """Names of the configuration classes, as one text."""
     settings: dict[str, Found]
     """Settings of the environment and of the learner, by dotted path."""
     methods: dict[str, list[Method]]
@@ -109,7 +109,7 @@ def _place(file: str, line: int) -> str:
 
 
 def run_child(path: Path, asked: str | None) -> dict[str, Any]:
-    """Run `child.py` and return its answer. `said` is the last line that the user's files printed."""
+    """Run `child.py` and return its answer. The entry `said` quotes the last line that the user's files printed."""
     request = {"file": str(path.resolve()), "task": asked, "known": ORIGINAL["known"], "methods": list(DIGESTS)}
     with tempfile.TemporaryFile() as output:
         try:

@@ -113,7 +113,9 @@ def _gains(result: Translation, robot: Robot, name: str, table: dict[str, float]
 def _contacts(
     result: Translation, theirs: str, patterns: list[str], shapes: Shapes, robot: str
 ) -> tuple[list[str], set[int]]:
-    """Return the patterns that match, some replaced by names of shapes, and the indices of the matched shapes."""
+    """Return the patterns that match, and the indices of the matched shapes. Names of shapes replace a pattern that would
+    wrongly match feet.
+    """
     found: set[int] = set()
     kept: list[str] = []
     for pattern in patterns:
@@ -122,7 +124,7 @@ def _contacts(
         except ConfigError:
             result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot} that collides")
             continue
-        # A pattern for a body does not mean feet: the shape of a foot may be on the body of the shank.
+        # A pattern that is only in a body's name excludes feet, because the shape of a foot may be on the body of the shank.
         named = theirs == LISTS[0][0] or any(pattern in name for name in shapes.names)
         chosen = [i for i in indices if named or shapes.contact[i] not in shapes.feet]
         kept += [pattern] if len(chosen) == len(indices) else [shapes.names[i] for i in chosen]

@@ -79,9 +79,9 @@ HISTORY = (
     *("env.frame_stack", "env.obs_history_length", "env.num_observation_history"),
     *("env.history_len", "env.include_history_steps"),
 )
-"""Names of the fork's setting for the number of steps in the policy's observations."""
+"""Names of the setting for the number of steps in the policy's observations, in various forks."""
 ONE_STEP = ("env.num_one_step_observations", "env.num_single_obs", "env.num_one_step_obs")
-"""Names of the fork's setting for the number of the policy's observations in one step."""
+"""Names of the setting for the number of the policy's observations in one step, in various forks."""
 
 NEAR = {
     r"init_state\.(lin|ang)_vel$|env\.randomize_start_vel": "init_state.base_velocity is the range of random velocities",
@@ -108,7 +108,8 @@ NEAR = {
     r"env\.(num_observations|num_privileged_obs)": "observations.groups",
     r"terrain\.(selected|terrain_kwargs|.*_kwargs)": "terrain.proportions and terrain.sizes choose types and their sizes",
     r"terrain\.restitution": "domain_rand.ranges.restitution",
-    r"terrain\.static_friction": "the ground has no friction here; this value is averaged into domain_rand.friction_range",
+    r"terrain\.static_friction": "the ground has no friction here; if friction is randomised, this value is averaged into"
+    " domain_rand.friction_range",
     r"control\.use_actuator_network": "legged_gym's network file is not read, and the robot's gains replace it;"
     " control.actuator.network names a network from legged fit-actuator",
     r"asset\.fix_base_link": "the base of a legged robot floats here",
@@ -149,7 +150,7 @@ TERRAIN_FUNCTIONS = {
     "discrete_obstacles_terrain": ["obstacles"] * 3,
 }
 """Isaac Gym's terrain functions -> terrain types of this package for a slope or step height that is negative, zero, and
-positive. If it is positive, the middle of a tile, where robots start, is the highest part.
+positive. With a positive slope or step height, the middle of a tile is the highest part. Robots start there.
 """
 
 PARTS = {

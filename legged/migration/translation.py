@@ -35,7 +35,7 @@ class Lost:
 
 @dataclass
 class Translation:
-    """The task that a configuration becomes."""
+    """A task that is made from a fork's configuration."""
 
     theirs: dict[str, Found]
     """Settings of the environment and of the learner, by dotted path."""
@@ -52,8 +52,9 @@ class Translation:
     """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
 
     def get(self, path: str, default: Any = None) -> Any:
-        """Return the fork's value of the setting `path`; `default` if it is not set or unknown. If `default` is a float, a
-        list or a table, the value must be a number, or a list or table of numbers; otherwise it is recorded as lost.
+        """Return the fork's value of the setting `path`, or `default` if the value is missing, unknown or of the wrong kind.
+        If `default` is a float, a list or a table, the value must be a number, a list of numbers or a table of numbers. A
+        value that is unknown or of the wrong kind is recorded as lost.
         """
         self.done.add(path)
         found, kind, fits = self.theirs.get(path), "", True
@@ -85,7 +86,7 @@ class Translation:
             self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path` to `value`, which comes from the fork's setting `theirs`. Record `theirs` as lost if it is refused."""
+        """Set `path` to `value`, which comes from the fork's setting `theirs`. If `path` refuses it, record a loss."""
         self.done.add(theirs)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")

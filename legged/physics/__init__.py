@@ -36,8 +36,8 @@ __all__ = [
 
 
 MANY_WORLDS = 256
-"""Smallest number of worlds for which `auto` chooses mujoco_warp on a CPU. With fewer worlds, compiling its kernels takes
-longer than its faster steps save."""
+"""Smallest number of worlds for which `auto` chooses mujoco_warp on a CPU. With fewer worlds, mujoco_warp's faster steps save
+less time than compiling its kernels takes."""
 
 
 def resolve_physics(name: str, device: torch.device, where: str = "sim.physics", num_envs: int = 1) -> str:

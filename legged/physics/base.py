@@ -30,28 +30,29 @@ class Physics(ABC):
     model: mujoco.MjModel
     """MuJoCo model of one world: names, masses, joints, actuators, geometry for rendering."""
     qpos: Tensor
-    """(N, nq) float32 positions in MuJoCo's layout, [m] and [rad]. A free joint has its position, world frame, then its
-    orientation (w, x, y, z). `qpos` is up to date after a step. After a write, it is up to date once `refresh` has run."""
+    """(N, nq) float32 positions in MuJoCo's layout, [m] and [rad]. A free joint has seven numbers: its position in the
+    world frame, then its orientation (w, x, y, z). `qpos` is up to date after `step`. After `write`, it is up to date once
+    `refresh` has run."""
     qvel: Tensor
-    """(N, nv) float32 velocities in MuJoCo's layout, [m/s] and [rad/s]. A free joint has the linear velocity of its origin,
-    world frame, then its angular velocity, body frame. Up to date whenever `qpos` is."""
+    """(N, nv) float32 velocities in MuJoCo's layout, [m/s] and [rad/s]. A free joint has six numbers: the linear velocity of
+    its origin in the world frame, then its angular velocity in the body frame. `qvel` is up to date whenever `qpos` is."""
     ctrl: Tensor
     """(N, nu) float32 controls, in the unit of the model's actuators ([N m] for motors of gear 1). The task writes them in
     place before a step; they keep their values until written again."""
     forces: Tensor | None = None
-    """(N, B, 6) external forces [N] and torques [N m] on the bodies of `model`, world frame, at their centres of mass. The
-    task writes them in place; they keep their values until written again or until `write` resets the world. None unless the
-    physics was made with `pushed`."""
+    """(N, B, 6) external forces [N] and torques [N m] at the centres of mass of the B bodies of `model`, in the world frame.
+    The task writes them in place; they keep their values until written again or until `write` resets the world. None if the
+    task applies no external forces (`make_physics(pushed=False)`)."""
     robot_state: RobotState | None = None
     """State of a robot with a floating base and feet; None for any other model."""
     why_library: str = ""
-    """Reason why parts of a step use the launches of the engine's library instead of the fused step. Empty if the fused step
-    does everything, or if the engine has no fused step."""
+    """Reason why the engine's library (mujoco-warp), not legged's fused step, computes parts of a step. Empty if the fused
+    step computes all parts, or if the engine has no fused step."""
     why_c_engine: str = ""
-    """Reason why `auto` chose the C engine although there are at least `MANY_WORLDS` worlds. Empty in all other cases."""
+    """Reason why `sim.physics=auto` chose the C engine for `MANY_WORLDS` or more worlds. Empty in all other cases."""
     fitted: str = ""
-    """Description of the simple shapes that replace meshes, which the terrain collider does not support. Empty if no mesh was
-    replaced."""
+    """Description of the simple shapes that replace meshes, because the terrain collider does not support meshes. Empty if
+    no mesh was replaced."""
     compiled: int = 0
     """Number of kernel modules that were not in the cache and were compiled for this physics."""
     overflowed: Tensor
@@ -61,11 +62,11 @@ class Physics(ABC):
     library_step: Callable[[], None] | None = None
     """Physics step of the engine's library, for comparison with the fused step; None if `step` is the library's step."""
     _quantities: dict[str, Tensor]
-    """Requested quantities by name."""
+    """Name -> tensor that `quantity` returns."""
 
     @abstractmethod
     def step(self) -> None:
-        """Advance by dt under `ctrl`. This updates `qpos` and `qvel`; `refresh` updates all other outputs."""
+        """Advance by dt with the controls `ctrl`. This updates `qpos` and `qvel`; `refresh` updates all other outputs."""
 
     @abstractmethod
     def refresh(self) -> None:
@@ -81,14 +82,14 @@ class Physics(ABC):
 
     @abstractmethod
     def push(self, mask: Tensor, delta: Tensor) -> None:
-        """Add `delta` (N, K) to the first K columns of `qvel` in the worlds of `mask` (N,). With a floating base, the first
-        columns are its linear velocity, world frame [m/s].
+        """Add `delta` (N, K) to the first K columns of `qvel` in the worlds of `mask` (N,). If the model has a
+        floating base, the first three columns are the base's linear velocity in the world frame [m/s].
         """
 
     @abstractmethod
     def randomize(self, field: str, values: Tensor) -> None:
-        """Set a field of the table `fields.FIELDS` at start-up. `values` are (N,), one for each world, or (N, rows), one for
-        each body, joint or shape of a world that the field changes. They replace earlier values of the field.
+        """Set a field of the table `fields.FIELDS` at start-up. `values` holds one number for each world, (N,), or one
+        for each body, joint or shape that the field changes, (N, rows). They replace earlier values of the field.
 
         Raises:
             ValueError: the physics was not made for this field, or the values have another shape.
@@ -97,8 +98,8 @@ class Physics(ABC):
     @abstractmethod
     def prepare_redraws(self, drawn: Tensor, columns: Mapping[str, slice], fields: Collection[str]) -> None:
         """Prepare `redraw` for `fields`, which must not be derived fields (`Field.derived`). Every `redraw` reads the random
-        values in `drawn` (N, V). `columns` gives the columns of a field in `drawn`: one column for all rows that the field
-        changes, or one for each row. `columns` must also contain all other randomised fields that change the same arrays.
+        values in `drawn` (N, V). `columns` maps a field to its columns of `drawn`: one for all bodies, joints or shapes that
+        the field changes, or one for each. `columns` must also contain other randomised fields that change the same arrays.
         """
 
     @abstractmethod
@@ -109,8 +110,9 @@ class Physics(ABC):
 
     @abstractmethod
     def set_variants(self, values: Mapping[str, Tensor]) -> None:
-        """Prepare K variants of the model. `values` holds (K, 1) or (K, rows) numbers for each derived field. For all
-        engines, C MuJoCo computes the derived constants, in about 0.05 ms for each variant.
+        """Prepare K variants of the model. For each derived field (`Field.derived`), `values` holds numbers: (K, 1), or
+        (K, rows) with one for each body or joint that the field changes. For all engines, C MuJoCo computes the constants
+        `fields.DERIVED`, in about 0.05 ms for each variant.
         """
 
     @abstractmethod
@@ -120,8 +122,8 @@ class Physics(ABC):
         """
 
     def quantity(self, name: str) -> Tensor:
-        """Return an array of MuJoCo's data by its MuJoCo name: (N, ...) float32 in MuJoCo's layout, frames and units
-        (`quantities.STAGES` and `LAST_STEP`). Every call returns the same tensor, which is up to date after a refresh.
+        """Return the array of MuJoCo's data named `name`: (N, ...) float32 in MuJoCo's layout, frames and units. The tables
+        `quantities.STAGES` and `LAST_STEP` list the names. Every call returns the same tensor; `refresh` updates it.
 
         Raises:
             ValueError: the physics was not made for this quantity.
@@ -130,19 +132,19 @@ class Physics(ABC):
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
-        """Return the arrays (N, ...) that determine the following steps, except `ctrl`, and the outputs of the last step.
+        """Return the arrays (N, ...) that, with `ctrl`, determine the following steps. Outputs of the last step are included.
         After `load_state` with copies of these arrays, the engine repeats the same steps; on a CPU they are bit-identical.
         """
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        """Set all worlds to a copy of `state_tensors`, and refresh.
+        """Set all worlds to the state `saved` (a copy of `state_tensors`), and call `refresh`.
 
         Raises:
             StateError: the state belongs to another engine, another model, or another number of worlds.
         """
         take(self.state_tensors(), saved, type(self).__name__)
         self.refresh()
-        if self.robot_state is not None:  # `refresh` may have overwritten them with the engine's own last forces
+        if self.robot_state is not None:  # `refresh` may have written contact forces of another step
             self.robot_state.contact_forces.copy_(saved["contact_forces"])
 
     @abstractmethod

@@ -34,8 +34,8 @@ def each_warning_once() -> Iterator[None]:
 
 
 def keep_out_of_files() -> None:
-    """Install a handler that prints each kind of warning once, unless another handler is installed. Without a handler,
-    MuJoCo would write MUJOCO_LOG.TXT.
+    """If no handler is installed, install one that prints each kind of warning once. Without a handler, MuJoCo would write
+    MUJOCO_LOG.TXT.
     """
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(warning_printer())

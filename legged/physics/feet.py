@@ -15,7 +15,7 @@ from legged.robots.robot import Robot
 
 @dataclass(frozen=True)
 class FootChains:
-    """Hinges between each foot and the base, driven or passive. Arrays are (levels, F, ...), with levels ordered from the
+    """Driven and passive hinges between each foot and the base. Arrays are (levels, F, ...), with levels ordered from the
     foot to the base; lengths are in metres. Each hinge has its own frame, in which `axis` and `anchor` are given. `body_pos`
     and `body_quat` are the pose of this frame at angle 0 in the frame of the next hinge.
     """
@@ -48,7 +48,7 @@ class FootChains:
             offsets.append(offset)
         if len({len(chain) for chain in feet}) != 1 or not feet[0]:
             raise ConfigError(
-                f"{robot.folder}: feet: all feet must have the same number of hinges between them and the base, at least one"
+                f"{robot.folder}: feet: all feet must have the same number of hinges between foot and base, and at least one"
             )
         levels = list(zip(*feet, strict=True))
         return cls(
@@ -72,8 +72,9 @@ class _Hinge:
 
 
 def _hinges(model: mujoco.MjModel, body: int, base: int, offset: np.ndarray, where: str) -> tuple[list[_Hinge], np.ndarray]:
-    """Return the hinges from `body` up to `base`, and the point `offset`, converted from the frame of `body` to that of the
-    first hinge. A body may have no hinge (if it is welded to its parent) or several. Error messages begin with `where`.
+    """Return the hinges from `body` up to `base`. Also convert the point `offset` from the frame of `body` to the frame of
+    the first hinge, and return it. A body may have no hinge (if it is welded to its parent) or several. Error
+    messages begin with `where`.
 
     Raises:
         ConfigError: a joint is not a hinge.
@@ -128,7 +129,7 @@ class _Level:
     along: Tensor
     """(F, 3, 3) projection on the axis a: a a^T."""
     across: Tensor
-    """(F, 3, 3) matrix of the cross product with the axis: a x."""
+    """(F, 3, 3) matrix of the cross product with the axis a: it maps v to a x v."""
     mount: Tensor | None
     """(F, 3, 3) orientation of the hinge's frame in the next frame; None if all these frames are parallel."""
     pos: Tensor
@@ -172,7 +173,7 @@ class FeetKinematics:
         """Compute `state.feet_pos` [m] and `state.feet_vel` [m/s], (N, F, 3), world frame, from the base and joint state."""
         feet, worlds = len(self._offset), len(state.base_pos)
         angles, rates = self._qpos.t().contiguous(), self._qvel.t().contiguous()
-        moved = torch.zeros(feet, 3, 2, worlds)  # points and velocities; after the last level, in the base frame
+        moved = torch.zeros(feet, 3, 2, worlds)  # [:, :, 0]: positions, [:, :, 1]: velocities
         moved[:, :, 0] = self._offset
         for level in self._levels:
             moved[:, :, 0] -= level.anchor
@@ -185,7 +186,7 @@ class FeetKinematics:
             if level.mount is not None:
                 moved = _apply(level.mount, moved)
             moved[:, :, 0] += level.pos
-        point, velocity = moved.unbind(2)
+        point, velocity = moved.unbind(2)  # in the base frame
         omega = state.base_ang_vel.t().contiguous().expand_as(point)
         velocity += state.base_lin_vel.t() + torch.linalg.cross(omega, point, dim=1)
         turn = quat_to_matrix(state.base_quat).permute(1, 2, 0)  # (3, 3, N)

@@ -30,7 +30,7 @@ def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
 
 
 def linear_actuators(model: mujoco.MjModel) -> np.ndarray:
-    """Return the indices of actuators with force gear * gain * control: all with a non-zero first gear, except muscles."""
+    """Return the indices of actuators with the force `gear * gain * control`: no muscles, and no actuators of gear 0."""
     muscle = model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE
     return np.flatnonzero((model.actuator_gear[:, 0] != 0.0) & ~muscle)
 
@@ -52,8 +52,8 @@ def damping_ratio(model: mujoco.MjModel) -> np.ndarray:
 
 
 def mirrored_per_gear(model: mujoco.MjModel) -> np.ndarray:
-    """Return the change of position bias that belongs to a change of gain by `per_gear`, for each actuator, (nu,):
-    `-per_gear` with an affine bias, otherwise 0. With both changes, a position servo keeps its target.
+    """Return, for each actuator, (nu,), the change of position bias that must accompany a change of gain by `per_gear`. It
+    is `-per_gear` for an affine bias, otherwise 0. With both changes, a position servo keeps its target position.
     """
     return -per_gear(model) * (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
 
@@ -71,8 +71,8 @@ class Change:
     least: float | None = 0.0
     """Smallest allowed number in the array; None for no limit."""
     bounce: Literal["", "ratio", "inverse"] = ""
-    """Conversion of restitutions: the array takes their damping ratios ("ratio"), or 1 / damping ratio ("inverse"). Empty if
-    the values are not restitutions."""
+    """Conversion of the values, if they are restitutions: to damping ratios ("ratio"), or to 1 / damping ratio ("inverse").
+    Empty for other fields."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Field:
     """Function that returns the indices of the array rows that the field changes."""
     changes: tuple[Change, ...]
     derived: bool = False
-    """True if a change requires MuJoCo to derive constants of the model again (`DERIVED`)."""
+    """True if MuJoCo must recompute the arrays `DERIVED` after a change of the field."""
     neutral: float = 0.0
     """Value that leaves the model unchanged, or a usual value if no value does."""
     lowest: float | None = None
@@ -112,7 +112,7 @@ FIELDS = {
         neutral=1.0,
     ),
     "restitution": Field(
-        "share of its speed that a shape keeps when it bounces; from it follows the contacts' damping ratio, which is 1 for"
+        "share of its speed that a shape keeps when it bounces; this share sets the contacts' damping ratio, which is 1 for"
         " shares below 0.135",
         "1",
         "shapes",
@@ -154,7 +154,7 @@ FIELDS = {
     },
     **{
         f"gravity_{axis}": Field(
-            f"acceleration added to gravity along the world's {axis} axis; `projected_gravity` stays the vertical",
+            f"acceleration added to gravity along the world's {axis} axis; `projected_gravity` does not include it",
             "m/s^2",
             "gravity",
             lambda _, model: np.zeros(1, dtype=int),
@@ -203,7 +203,7 @@ FIELDS = {
         lowest=0.0,
     ),
     "actuator_gain": Field(
-        "addition to the force or torque per unit of control, which is the stiffness of a position servo",
+        "addition to each actuator's force or torque per unit of control (for a position servo: to its stiffness)",
         "N m or N",
         "actuators",
         lambda _, model: linear_actuators(model),
@@ -242,15 +242,15 @@ FIELDS = {
 }
 """Field name -> field. Fields that scale an array precede those that add to it."""
 MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
-"""Fields that change the model, which `Physics.randomize` accepts. The others affect only the control law."""
+"""Fields that change arrays of the model. `Physics.randomize` accepts these. All other fields affect only the control law."""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
-"""Fields that every solver of Newton supports, because Newton's own model has arrays for them. Newton's MuJoCo solver
-supports all fields."""
+"""Fields that every solver of the engine `newton` supports, because the engine's own model has arrays for them. The
+engine's solver `mujoco` supports all fields."""
 
 
 def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
-    """Return, for each field, the number of array rows that it changes, or of joints if it changes no array."""
+    """Return, for each field, the number of array rows that it changes, or the number of joints if it changes no array."""
     return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
 
 

@@ -51,7 +51,7 @@ class MujocoPhysics(Physics):
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)
-        # A world that diverges must stay non-finite until the task sees it. By default the engine resets it silently.
+        # By default MuJoCo silently resets a state that diverges. Here it must stay non-finite, so that the task sees it.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Constraint islands gain nothing, because a world holds one robot. Finding them costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
@@ -95,7 +95,7 @@ class MujocoPhysics(Physics):
     def refresh(self) -> None:
         self._read()
         if self._robot is not None:
-            self._robot.read()  # must precede `_reader.read`, which overwrites the sensor data
+            self._robot.read()  # `_reader.read` overwrites the sensor data, so the robot is read first
         self._reader.read()
         warnings = self.batch.warning[:, OVERFLOW, 1]
         self.overflowed.copy_(torch.from_numpy((warnings > self._warnings).any(axis=1)))
@@ -191,12 +191,12 @@ class _RobotReader:
         self._down = torch.tensor([0.0, 0.0, -1.0]).expand(len(state.base_pos), 3)
 
     def read(self) -> None:
-        """Update velocity and gravity in the base frame, the feet, and, on the first call after a step, contact forces."""
+        """Update the base's velocity and gravity in the base frame, and the feet. After a step, update contact forces too."""
         state = self._state
         state.base_lin_vel.copy_(quat_rotate_inverse(state.base_quat, state.base_lin_vel_w))
         state.projected_gravity.copy_(quat_rotate_inverse(state.base_quat, self._down))
         self._feet.write(state)
-        if self.stepped:  # on a second call, this would undo the clearing of forces by `write`
+        if self.stepped:  # without a new step, a copy would restore the forces that `write` has cleared
             forces = torch.from_numpy(-self._forces.astype(np.float32)).view(len(self._forces), -1, 3)
             if self._contacts is None:
                 state.contact_forces.copy_(forces)
@@ -206,7 +206,7 @@ class _RobotReader:
 
 
 class _QuantityReader:
-    """Copies of the requested quantities from the batch's arrays, updated for the worlds whose state has changed."""
+    """Copies requested quantities from the batch's arrays. `read` updates only the worlds whose state has changed."""
 
     def __init__(self, batch: Batch, names: Collection[str]) -> None:
         """Prepare to copy the quantities `names`."""

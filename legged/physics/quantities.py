@@ -18,7 +18,7 @@ STAGES = {
 x, y, z) of bodies; centres of mass of subtrees [m]; inertias (10) and velocities (6: angular, linear) of bodies about the
 centre of mass of their kinematic tree."""
 LAST_STEP = ("qfrc_actuator",)
-"""Quantities that a step computes and a write sets to zero: (N, nv) generalised actuator forces [N m] or [N]."""
+"""Quantities that a step computes and `Physics.write` clears: (N, nv) generalised actuator forces [N m] or [N]."""
 
 
 def check_quantities(names: Collection[str]) -> None:

@@ -77,9 +77,9 @@ class RandomizedModel:
         part[:, rows] = {"set": values.expand_as(old), "add": old + values, "scale": old * values}[change.how]
 
     def variants(self, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the arrays of K model variants, (K, ...): those that derived fields change, and those that C MuJoCo derives
-        from them (`DERIVED`). `values` holds (K, 1) or (K, rows) numbers for each field. They are computed outside steps,
-        because a captured step cannot derive constants.
+        """Return the arrays of K model variants, (K, ...): the arrays that derived fields change, and the arrays `DERIVED`,
+        which C MuJoCo computes from them. `values` holds (K, 1) or (K, rows) numbers for each field. Variants are computed
+        outside steps, because a captured step cannot compute the arrays `DERIVED`.
         """
         on_host = RandomizedModel(self._scene, self.model, values, torch.float64, torch.device("cpu"))
         changed = on_host.arrays(changed_arrays(values), values)
@@ -128,7 +128,7 @@ def check_ranges(
         if not len(field.rows(scene, model)):
             raise ConfigError(f"{path}: {scene.name} has no {field.what}")
         if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
-            reason = "contacts have a stiffness (a negative solref) instead of a time constant"
+            reason = "restitution needs contacts with a time constant, but these have a stiffness (a negative solref)"
             raise ConfigError(f"{path}: {scene.name}: {reason}")
         changed = given.give(name, torch.tensor([low], dtype=torch.float64)) if field.changes else {}
         for change in field.changes:

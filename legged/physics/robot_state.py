@@ -48,7 +48,7 @@ class DrivenJoints:
     """
 
     def __init__(self, qpos: Tensor, qvel: Tensor, state: RobotState, robot: Robot) -> None:
-        """Copy from `qpos` (N, nq) and `qvel` (N, nv) into `state`, in place."""
+        """Prepare to copy columns of `qpos` (N, nq) and `qvel` (N, nv) into `state`."""
         pairs = ((qpos, state.dof_pos, robot.qpos_columns), (qvel, state.dof_vel, robot.qvel_columns))
         self._pairs = [
             (source, target, torch.tensor(columns, device=source.device))

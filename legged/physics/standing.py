@@ -16,8 +16,8 @@ COSTLY_CONTACTS = {"cone": "elliptic", "impratio": 100.0}
 
 
 def height_under_gains(robot: Robot, stiffness: np.ndarray, damping: np.ndarray) -> float:
-    """Simulate a robot on a plane for two seconds, with PD control towards its default pose and gains (D,). Return the final
-    height of the base [m], or 0 if the motion diverges. The stiffness of a wheel acts on its speed, as a brake.
+    """Simulate a robot on a plane for two seconds. PD control with the gains `stiffness` and `damping` (D,) holds the default
+    pose. Return the final height of the base [m], or 0 if the motion diverges. The stiffness of a wheel brakes its rotation.
     """
     sim = SimConfig(**COSTLY_CONTACTS)  # type: ignore[arg-type]
     model = RobotScene(robot).model(sim)

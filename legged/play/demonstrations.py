@@ -35,7 +35,7 @@ FILM_S = 20.0
 
 
 class TrackingErrors:
-    """Sums of the squared velocity errors, and numbers of falls, of N robots."""
+    """Sums of squared velocity errors, and numbers of falls, for each of N robots."""
 
     COLUMNS = ("velocity RMSE", "yaw rate RMSE", "falls")
     """Headings of the columns of `row`."""

@@ -32,10 +32,10 @@ FILM_S, WARM_UP_S = 4.0, 2.0
 SPEED = 0.6
 """Commanded forward velocity of a walk as a share of the largest trained one."""
 FILL, GLIDE = 0.82, 0.5
-"""Share of the picture's size that the robot fills in its default pose; share of its distance to the robot by which the
-camera moves in each picture."""
+"""FILL: share of the picture's width or height that the robot fills in its default pose. GLIDE: how far the camera's target
+moves towards the robot in each picture, as a share of their distance."""
 SHARP = 2
-"""Factor by which pictures of a walk are rendered larger; scaling them down smooths edges."""
+"""Factor by which pictures of a walk are rendered larger. They are then scaled down, which smooths edges."""
 MOST_BYTES = 2_000_000
 """Size limit of the GIF of a walk [bytes]."""
 SMALLER: tuple[tuple[int, float], ...] = (

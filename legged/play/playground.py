@@ -40,8 +40,8 @@ class Playground:
 
     @classmethod
     def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
-        """Return the playground for --terrain (`name`) and --difficulty: COLUMNS columns of the type `name` or, with no name,
-        a column for each type of the task. Without a name, return None for a task on a plane.
+        """Return the playground for --terrain (`name`) and --difficulty. It has COLUMNS columns of the type `name`. If `name`
+        is None, it has a column for each terrain type of the task, or is None for a task on a plane.
 
         Raises:
             ConfigError: the type or the difficulty does not exist.
@@ -63,7 +63,7 @@ class Playground:
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
 
         def size(kind: str, usual: float) -> float:
-            """Return the size of a tile at `difficulty`, or if that is None, at the difficulty `usual` of the training."""
+            """Return a tile's size at `difficulty` or, if that is None, the training's size at the difficulty `usual`."""
             if difficulty is None:
                 return tile_size(cfg.terrain, kind, usual)
             return TERRAIN_TYPES[kind].sized(difficulty, cfg.terrain.scale)
@@ -96,7 +96,7 @@ class Playground:
         return Terrain.of_tiles(self.rows, cfg.terrain, np.random.default_rng(cfg.env.seed))
 
     def columns(self, num_envs: int, shift: int = 0) -> list[int]:
-        """Return the column index of each robot. `shift` moves all robots on by so many places in `order`."""
+        """Return the column index of each robot. All robots move on by `shift` places in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
     def place(self, task: LeggedRobot, shift: int = 0) -> None:

@@ -33,7 +33,7 @@ class Keyboard:
         """Number of times that the next tile was requested."""
 
     def press(self, key: int) -> None:
-        """Process a key by its GLFW code; other keys have no effect."""
+        """Process a key, given by its GLFW code. Keys without a function have no effect."""
         if key in self.MOVES:
             axis, sign = self.MOVES[key]
             moved = round(self.command[axis] + sign * STEP[axis], 3)
@@ -48,7 +48,7 @@ class Keyboard:
 @torch.inference_mode()
 def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> None:
     """Show the task's first environment, on the `playground` if one is given, in real time until the window is closed."""
-    import mujoco.viewer  # imported here, because a machine without a display may lack a library
+    import mujoco.viewer  # imported here, because machines without a display may lack its libraries
 
     legged = task if isinstance(task, LeggedRobot) else None
     low, high = legged.command_sampler.full_ranges.t().tolist() if legged else ([0.0] * 3, [0.0] * 3)

@@ -25,8 +25,8 @@ LAWS = {
 SHARED = {
     "observation": "for each term clip(scale * value, -observation_clip, observation_clip), at its columns start to"
     " start + size, without noise",
-    "history": "the last observation_history observations side by side, oldest first; at the start of an episode all are"
-    " the first one",
+    "history": "the last observation_history observations side by side, oldest first; at the start of an episode, all of"
+    " them are its first observation",
 }
 """Conventions of all tasks."""
 MODEL_CONVENTIONS = {
@@ -42,7 +42,7 @@ FRAMES = ("base frame", "yaw frame", "world frame")
 
 def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any]:
     """Return the observation layout with units, frames and formulas, the joints, the control law and time steps. Keys are
-    never renamed. The noise comes from `trained`, the configuration of the training, or else from that of the task.
+    never renamed. The noise is that of `trained`, the configuration of the training. If it is None, the noise is the task's.
     """
     cfg = task.cfg
     groups: list[dict[str, Any]] = []
@@ -120,25 +120,24 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
     laws = task.control.laws
     law = LAWS[laws[0]] if task.control.law else "; ".join(f"{name} joints: {LAWS[name]}" for name in sorted(set(laws)))
     return {
-        "imu_frame": "angular velocity and gravity are those of the frame of this body, which is the base frame: what an IMU"
-        " measures that is turned or sits elsewhere must be turned into it",
-        "needs": "what a term is made of: a sensor of the robot, the command, what the program remembers, or a source"
-        " beside these",
-        "scan": "what a point of the heights reads of a map of cells: the lowest of its cell and the next ones in x and y,"
-        " its own, or the highest of the three",
+        "imu_frame": "the frame of this body is the base frame; angular velocity and gravity are given in it, so measurements"
+        " of an IMU with another orientation must be rotated into it",
+        "needs": "input of a term: a sensor of the robot, the command, memory (the last actions), or an additional source",
+        "scan": "height that a measured point reads from the height map: own is the height of the point's cell; lowest and"
+        " highest are taken from three cells, this cell and the next ones along +x and +y",
         "noise": "half width of the uniform noise that the policy was trained with, in the term's unit before scaling",
-        "crouch_joint_angles": "a robot that lies stands up by way of these angles; null if it has no such pose",
-        "command_dead_zone": "horizontal commands that are shorter were never asked for, but 0 [m/s]",
+        "crouch_joint_angles": "pose on the way from lying to standing; null if the robot has no such pose",
+        "command_dead_zone": "norm below which the training set horizontal velocity commands to zero [m/s]",
         "base frame": f"fixed to the body '{task.robot.file.base}': x forward, y left, z up",
         "yaw frame": "origin at the base, z vertical, x where the base frame's x points, seen from above",
         "world frame": "z up",
         "quaternion": "(w, x, y, z), turns the base frame into the world frame",
         "units": "SI: m, s, rad, N m; numbers by joint are in the order of joint_names",
         **SHARED,
-        "observation_groups": "group by group side by side, each at its columns start to start + history * size, with as many"
-        " observations of its own terms as its history says; start of a term is where it lies in the oldest of them",
-        "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of"
-        " action_joints; action_scale is one number, or one for each of them; a joint without action has 0 in its place",
+        "observation_groups": "groups lie side by side, each at its columns start to start + history * size, which hold its"
+        " last observations, oldest first; start of a term is the term's first column in the oldest observation",
+        "action": "actions = policy(observation), then clipped at plus and minus action_clip, one for each of action_joints;"
+        " action_scale is one number, or one for each of action_joints; a joint without an action has action 0",
         "torque": f"clip({law}, -torque_limits, torque_limits), anew every sim_dt",
         "actuator": "the motors of the training: the section control.actuator of its configuration; delay in steps of sim_dt",
         "time": "every control_dt: observe, run the policy, hold its action for control_dt",
@@ -146,8 +145,8 @@ def conventions(task: LeggedRobot) -> dict[str, str]:
 
 
 def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], noise: float) -> dict[str, Any]:
-    """Return the description of an observation term. `noise` is the half width of its noise. `@unit` declares the unit; frame
-    and formula come from the docstring of the term's method.
+    """Return the description of an observation term. `noise` is the half width of its noise. The term's method has the unit
+    in its decorator `@unit`, and frame and formula in its docstring.
     """
     method = getattr(type(task), f"_obs_{term.name}")
     text = " ".join((inspect.getdoc(method) or "").partition("\n\n")[0].split())

@@ -1,4 +1,4 @@
-"""Measurements of a policy over full episodes, in any task: returns, in total and by term, lengths and failures."""
+"""Measurements of a policy over full episodes, in any task: returns (in total and by term), lengths and failures."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -32,7 +32,7 @@ def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, l
 
 
 def unit_of(task: BaseTask) -> float:
-    """Return the divisor that converts rewards to the task's unit: there, a term adds scale * value in each step."""
+    """Return the divisor that converts rewards to the task's unit, in which a term adds scale * value in each step."""
     return task.dt if task.cfg.rewards.times_dt else 1.0
 
 
@@ -42,8 +42,8 @@ def measure_episodes(task: BaseTask, act: Policy, after_step: Callable[[int, flo
     numbers: `return`, `terms` (return by reward term), `length` [steps], `failures` (share), `metrics` (means over all
     environments and steps) and `contact_overflows`.
 
-    The return is the undiscounted sum of scale * term over steps: `rewards.times_dt` does not change it. `after_step` gets
-    the number of the step, from 0, and the first environment's return so far.
+    The return is the undiscounted sum of scale * term over steps. It does not depend on `rewards.times_dt`. `after_step`
+    gets the number of the step, from 0, and the first environment's return so far.
     """
     observations = task.reset()
     device = torch.device(task.device)

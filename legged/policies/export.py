@@ -1,4 +1,4 @@
-"""Export of a policy as TorchScript, ONNX and plain numbers with a description, checked against torch."""
+"""Export of a policy as TorchScript, ONNX and plain numbers, with a description. Files are checked against the policy."""
 
 import hashlib
 import io
@@ -32,9 +32,9 @@ CHECKED_OBSERVATIONS = 1000
 CHECKED_SEQUENCE = (100, 3)
 """Numbers of steps and robots with which the export of a recurrent policy is checked."""
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
-"""Pairs of step and robot at which an episode begins during that check."""
+"""Pairs (step, robot): in the check of a recurrent policy, an episode of this robot begins at this step."""
 LARGEST_DIFFERENCE = 1e-4
-"""Largest allowed difference of an exported action from the policy's, relative to the largest action if that is above 1."""
+"""Largest allowed difference of a file's actions from the policy's, divided by the larger of 1 and the largest action."""
 
 
 class ExportError(RunError):
@@ -52,10 +52,11 @@ def export(
     numbers, legged.deploy.weights); return the largest difference of each file's actions from the policy's.
 
     All files map a flat observation (batch, width) to actions (batch, joints), without noise. The observation has the
-    policy's groups side by side; a group with a history of H steps has H observations, oldest first. The TorchScript of a
-    recurrent policy keeps the hidden state for a batch of 1 until its reset(); the ONNX has it as inputs and outputs. The
-    ONNX file and policy.json have the metadata, including `training`; policy.json also has the files' checksums. `trained` is
-    the configuration of the training if it differs from the task's. A learned actuator's network is copied to the folder.
+    policy's groups side by side; a group with a history of H steps has H observations, oldest first. For a recurrent
+    policy, policy.pt keeps the hidden state, for a batch of 1, until its method `reset` is called; policy.onnx has the hidden
+    state as inputs and outputs. policy.onnx and policy.json contain the description and `training`; policy.json also has the
+    files' checksums. `trained` is the configuration of the training if it differs from the task's. A learned actuator's
+    network is copied to the folder.
 
     Raises:
         ExportError: the actions of a file differ from the policy's.
@@ -174,13 +175,13 @@ def _torchscript(policy: Any) -> bytes:
 
 
 def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
-    """Return the ONNX file of a policy. The batch size is free, and each key of `metadata` has its value as JSON."""
+    """Return the ONNX file of a policy, for any batch size. Its metadata has the keys of `metadata`, with values as JSON."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
     buffer = io.BytesIO()
     inputs, outputs = module.input_names, module.output_names
     hidden = {name: {1: "batch"} for name in (*inputs[1:], *outputs[1:])}
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # caused by checks of shapes
+        warnings.filterwarnings("ignore", category=torch.jit.TracerWarning)  # checks of shapes cause this warning
         warnings.filterwarnings("ignore", message="Exporting a model to ONNX with a batch_size other than 1")
         torch.onnx.export(
             module,

@@ -38,13 +38,13 @@ TERMS = {
 }
 """Terms of which an observation may consist."""
 COMMANDS = ("command_xy", "command_yaw")
-"""Terms of a layout that split the term `commands` of policy.json: its first two columns, and its third column."""
+"""Terms of a layout for the two parts of the term `commands` of policy.json: its first two columns, and its third column."""
 JOINTS, STIFFNESS, DAMPING = (
     ("dof_names", "joint_names"),
     ("kp", "stiffness", "joint_stiffness"),
     ("kd", "damping", "joint_damping"),
 )
-"""Possible keys in an ONNX file's metadata: of the joints in the network's order, of P gains, and of D gains."""
+"""Possible keys in an ONNX file's metadata for the joints in the network's order, for P gains, and for D gains."""
 
 
 @dataclass(frozen=True)
@@ -58,20 +58,20 @@ class Layout:
     action_clip: float = field(default=100.0, metadata=positive(LARGEST))
     """Absolute value at which actions are clipped."""
     joints: tuple[str, ...] = ()
-    """Joints in the policy's order; empty takes the joints that the ONNX file names, or else the robot's."""
+    """Joints in the policy's order. If empty: those in the ONNX file's metadata, or else the robot's."""
     action_joints: tuple[str, ...] = ()
-    """Joints that have an action, in the order of the actions; the others stay at their default angles. Empty takes all
-    joints."""
+    """Joints that have an action, in the order of the actions. Joints without an action stay at their default angles. If
+    empty: all joints."""
     default_joint_angles: dict[str, float] = field(default_factory=dict, metadata=between(-100, 100))
-    """Joint-name pattern -> angle at action 0 [rad]; empty takes the robot's."""
+    """Joint-name pattern -> angle at action 0 [rad]. If empty: the robot's."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]; empty takes the ONNX file's, or else the robot's."""
+    """Joint-name pattern -> P gain [N m/rad]. If empty: the gains in the ONNX file's metadata, or else the robot's."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; empty as for `stiffness`."""
+    """Joint-name pattern -> D gain [N m s/rad]. If empty: the gains in the ONNX file's metadata, or else the robot's."""
     torque_limits: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
-    """Joint-name pattern -> largest torque [N m]; empty takes the robot's."""
+    """Joint-name pattern -> largest torque [N m]. If empty: the robot's."""
     implicit_gains: bool = False
-    """True if the gains are those of MuJoCo's position actuators with the integrator implicitfast, not of an explicit law."""
+    """True: gains of MuJoCo's position actuators with the integrator implicitfast. False: gains of an explicit PD law."""
     observation_clip: float = field(default=LARGEST, metadata=positive(LARGEST))
     """Absolute value at which scaled observations are clipped."""
     velocity_point: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), metadata=between(-100, 100))
@@ -118,7 +118,7 @@ def read_layout(name: str, where: str) -> Layout:
 
 
 def _layout_of(contract: Contract) -> Layout:
-    """Return the layout of an exported policy, which must observe a single step, with one scale for each term."""
+    """Return the layout of an exported policy. The policy must observe a single step and have one scale for each term."""
     path = contract.path
     if contract.states or any(group.history != 1 for group in contract.groups):
         raise ConfigError(f"{path}: the policy has a memory or a history; only policies with neither can be played here")
@@ -168,11 +168,11 @@ class ForeignPolicy:
     """A policy on one robot with D joints. Arguments and results have the robot's joint order; the network has its own."""
 
     def __init__(self, path: Path, layout: Layout, robot: Robot) -> None:
-        """Load the ONNX file at `path`; its metadata, texts by name, are in `metadata`.
+        """Load the ONNX file at `path`. The attribute `metadata` holds the texts in the file's metadata by name.
 
         Raises:
-            ConfigError: the file cannot be read, its joints are not the robot's, its sizes are not the layout's, its actions
-                are not finite, or the layout is the contract of another export.
+            ConfigError: the file cannot be read, its joints are not the robot's, its sizes are not the layout's, or the
+                layout is the contract of another export.
         """
         self.layout, self._path, self._session = layout, path, open_onnx(path)
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
@@ -184,7 +184,9 @@ class ForeignPolicy:
             if name not in names:
                 raise ConfigError(f"{path}: robot '{robot.name}' has no joint '{name}'{suggest(str(name), names)}")
         if len(set(joints)) != len(joints) or len(joints) != robot.num_dof:
-            raise ConfigError(f"{path}: it names {len(set(joints))} joints, but '{robot.name}' has {robot.num_dof}")
+            raise ConfigError(
+                f"{path}: its metadata or layout names {len(set(joints))} joints, but '{robot.name}' has {robot.num_dof}"
+            )
         acted = list(layout.action_joints) or joints
         if len(set(acted)) != len(acted):
             raise ConfigError(f"{path}: action_joints: names a joint twice")
@@ -241,7 +243,7 @@ class ForeignPolicy:
             raise ConfigError(f"{self._path}: takes {inputs[0].shape[1]} numbers, but the layout's observation has {width}")
         count = len(self._acted)
         if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != count:
-            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, but {count} joints take one")
+            raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, but {count} joints have an action")
 
     def reset(self) -> None:
         """Start an episode."""

@@ -30,16 +30,16 @@ class TrainedPolicy:
         return self.checkpoint.parent
 
     def output(self, what: str) -> Path:
-        """Return the default folder for output about the policy: the run folder, or logs/<what>/<task> for a shipped policy,
-        whose folder belongs to the package and may not be writable.
+        """Return the default folder for output about the policy: the run folder, but logs/<what>/<task> for a shipped policy.
+        A shipped policy is inside the package, whose folders can be read-only.
         """
         return Path("logs") / what / self.folder.name if self.folder.parent.name == "policies" else self.folder
 
 
 def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLICY") -> TrainedPolicy:
-    """Return the policy that a user names. The name is a task or its YAML file (for the newest run, else the shipped policy),
-    a run `<experiment>/<run>` below logs/, or a folder. `checkpoint` is an iteration, 'best' or None for the latest;
-    `where` is the argument that gave the name.
+    """Return the policy that a user names. `name` is a run `<experiment>/<run>` below logs/, a folder, or a task or its YAML
+    file. For a task, take its newest run, or its shipped policy if there is no run. `checkpoint` is an iteration or 'best';
+    None takes the latest checkpoint. `where` is the argument that gave the name.
 
     Raises:
         ConfigError: there is no such policy or checkpoint, or its task is not known.
@@ -48,14 +48,14 @@ def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLI
     cfg = run_config(folder, where)
     if cfg.task not in task_names():  # a run stores neither the file nor the class of its task
         raise ConfigError(
-            f"{where}: {relative(folder)} was trained on a user-defined task, '{cfg.task}'; name the file that defines it"
-            " with --import FILE"
+            f"{where}: {relative(folder)} was trained on a user-defined task, '{cfg.task}'; to name the file that"
+            " defines it, use --import FILE"
         )
     return TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
 
 
 def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
-    """Return overrides for measuring: no noise, pushes or curriculum, friction 1, nominal mass, and long episodes."""
+    """Return overrides for measurements: the model's friction and mass, long episodes, and no noise, pushes or curriculum."""
     return [
         ("env.num_envs", num_envs),
         ("env.episode_length_s", seconds + 10.0),
@@ -68,12 +68,12 @@ def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
 
 
 def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:
-    """Return the configuration for measurements: the nominal model, without randomisation except by `changes`.
+    """Return a training's configuration for measurements. Randomisation is off, unless `changes` switch it on.
 
     Raises:
         ConfigError: the changes do not fit the configuration.
     """
-    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # without training, robots need not fill mini-batches
+    few_robots_do = ("train.algorithm.num_mini_batches", 1)  # `check` refuses more mini-batches than samples
     cfg = override(cfg.trained(), [*changes, few_robots_do])
     task_class(cfg.task).check(cfg)
     return cfg

@@ -16,11 +16,11 @@ Argument = Callable[[argparse.ArgumentParser], object]
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 """Pattern of negative numbers, which look like options. Before Python 3.14 argparse takes -1e-1 for an option."""
 OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
-"""Options of legged_gym, which may also be written with underscores."""
+"""Pattern of options that exist in legged_gym too. They may be written with underscores, as in legged_gym."""
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Parser of one command's arguments, whose help ends with examples."""
+    """Parser of one command's arguments. Its help ends with examples."""
 
     def __init__(self, prog: str, description: str | None, *examples: str, arguments: Iterable[Argument] = ()) -> None:
         """Build the parser. `prog` is the words that call the command; `examples` are two or more complete command lines."""
@@ -65,9 +65,9 @@ def argument(*names: str, **options: Any) -> Argument:
 
 
 IMPORT = argument(
-    "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; several with commas"
+    "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; join several by commas"
 )
-"""The option --import, which names user-defined tasks. `args.module` holds its value."""
+"""The option `--import`, for files and modules with user-defined tasks. `args.module` holds its value."""
 
 
 def check_number(flag: str, value: float | None, least: float, most: float = math.inf, above: bool = False) -> None:

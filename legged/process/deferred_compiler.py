@@ -1,10 +1,10 @@
-"""Deferred import of torch's compiler, until a function is compiled.
+"""Import of torch's compiler, deferred until a function is compiled.
 
 `torch._dynamo` and its imports (sympy, torch._inductor, parts of torch.distributed) are a third of the modules that a
-training imports and a third of its start-up time, although this package compiles nothing. Other libraries import the compiler
-nevertheless: tensordict marks some of its functions for it, and torch's optimisers and dispatch modes exclude their own code
-from it. A stand-in module records these marks. The first use of any other attribute imports the real module and passes the
-marks on.
+training imports and take a third of its start-up time, although this package compiles nothing. Other libraries import the
+compiler nevertheless: tensordict marks some functions for the compiler, and torch's optimisers and dispatch modes exclude
+their own code from compilation. A stand-in module records these marks. The first use of any other attribute imports the real
+module and passes the marks on.
 """
 
 import importlib
@@ -21,7 +21,7 @@ from typing import Any
 
 NAME = "torch._dynamo"
 KNOWN = ("2.13.",)
-"""Versions of torch whose use of the compiler the stand-in supports; under any other version the real module is imported as
+"""Prefixes of the versions of torch that the stand-in supports. With any other version the real module is imported as
 usual.
 """
 
@@ -35,7 +35,7 @@ class DeferredCompiler(ModuleType):
         """Create the stand-in for the package in `folder`."""
         super().__init__(NAME, "A stand-in for torch's compiler.")
         spec = importlib.util.spec_from_file_location(NAME, folder / "__init__.py", submodule_search_locations=[str(folder)])
-        # Some code reads attributes such as `__file__` of every module. That must not import the compiler.
+        # Some code reads attributes such as `__file__` of every module. They are set here without the real module.
         self.__spec__, self.__file__, self.__path__ = spec, str(folder / "__init__.py"), [str(folder)]
         self.__package__ = NAME
         self._marks: list[tuple[str, Any]] = []
@@ -44,15 +44,15 @@ class DeferredCompiler(ModuleType):
         self.assume_constant_result = partial(self._mark, "assume_constant_result")
 
     def _mark(self, name: str, function: Any) -> Any:
-        """Mark a function by the compiler's function `name`. The stand-in only records the mark, for the real module."""
+        """Mark `function` by the compiler's function `name`. Until the real module is imported, only record the mark."""
         if not self.stands:
             return getattr(self.real(), name)(function)
         self._marks.append((name, function))
         return function
 
     def disable(self, function: Any = None, *args: Any, **kwargs: Any) -> Any:
-        """Return the function unchanged if the caller is torch's own wrapper, which calls once and keeps the result. Pass any
-        other call on to the real module.
+        """Return the function unchanged if the caller is torch's own wrapper, which calls `disable` once and keeps the
+        result. Pass any other call on to the real module.
         """
         if self.stands and sys._getframe(1).f_globals.get("__name__") == "torch._compile":
             self._not_disabled.append(function)
@@ -60,7 +60,7 @@ class DeferredCompiler(ModuleType):
         return self.real().disable(function, *args, **kwargs)
 
     def graph_break(self, *args: Any, **kwargs: Any) -> None:
-        """Do nothing, because outside of compiled code the real function does nothing either."""
+        """Do nothing before the real module is imported. Outside compiled code the real function does nothing either."""
         if not self.stands:
             self.real().graph_break(*args, **kwargs)
 
@@ -78,7 +78,8 @@ class DeferredCompiler(ModuleType):
         for name, function in self._marks:
             getattr(real, name)(function)
         for function in self._not_disabled:
-            vars(function).pop("__dynamo_disable", None)  # without the kept result, torch's wrapper asks the real module
+            # Remove the result that torch's wrapper has kept. At its next call the wrapper then asks the real module.
+            vars(function).pop("__dynamo_disable", None)
         return real
 
     @property
@@ -89,7 +90,7 @@ class DeferredCompiler(ModuleType):
 
 class _Submodules:
     """Finder and loader of the compiler's submodules. It first imports the compiler, which imports most of its submodules
-    itself. Python then gets the module that is already imported, not a second copy.
+    itself. Python then gets the submodule that is already imported, not a second copy.
     """
 
     def __init__(self, stand_in: DeferredCompiler) -> None:
@@ -97,7 +98,7 @@ class _Submodules:
         self._specs: dict[str, ModuleSpec | None] = {}
 
     def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> ModuleSpec | None:
-        """Return the spec of a submodule that the compiler's import has just loaded; None for all others."""
+        """Return the spec of a submodule that the compiler's import has just loaded; None for any other module."""
         if not self._stand_in.stands or not name.startswith(f"{NAME}."):
             return None
         self._stand_in.real()
@@ -114,13 +115,11 @@ class _Submodules:
 
 
 def defer_compiler() -> None:
-    """Install the stand-in for the compiler, unless the compiler or torch is already imported, or torch is missing or of an
-    unknown version.
-    """
+    """Install the stand-in if torch is installed in a known version, and neither torch nor its compiler is imported yet."""
     torch = importlib.util.find_spec("torch") if "torch" not in sys.modules else None
     if torch is None or torch.origin is None or NAME in sys.modules:
         return
-    with suppress(importlib.metadata.PackageNotFoundError):  # torch may not state its version
+    with suppress(importlib.metadata.PackageNotFoundError):  # torch without package metadata has no version
         if importlib.metadata.version("torch").startswith(KNOWN):
             stand_in = DeferredCompiler(Path(torch.origin).parent / "_dynamo")
             sys.modules[NAME] = stand_in

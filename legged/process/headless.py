@@ -15,7 +15,7 @@ from legged.errors import ConfigError, suggest
 from legged.process.startup import command_of_ours
 
 NO_PICTURES = ""
-"""Reason why this process cannot draw: the library that MUJOCO_GL names does not work. Empty if it works."""
+"""Reason why this process cannot draw, if the library that MUJOCO_GL names does not work; else empty."""
 ANSWER_S = 0.5
 """Time after which a display that does not answer counts as missing [s]."""
 OFF = ("disable", "disabled", "off", "false", "0")
@@ -27,7 +27,7 @@ ON = ("", "enable", "enabled", "on", "true", "1")
 
 
 def display_answers() -> bool:
-    """Return True if a display accepts connections. DISPLAY alone is no proof: it may name one that no longer exists."""
+    """Return True if a display accepts connections. DISPLAY may name a display that no longer exists."""
     if sys.platform != "linux":
         return True
     wayland = os.environ.get("WAYLAND_DISPLAY")
@@ -61,7 +61,7 @@ def _connects(address: str | tuple[str, int]) -> bool:
 def off_screen_library() -> str | None:
     """Return the value of MUJOCO_GL that works on this machine: 'egl' or 'osmesa'; None if neither does.
 
-    MuJoCo fails at import if MUJOCO_GL names a missing library, so a machine that only trains must not set it.
+    MuJoCo fails at import if MUJOCO_GL names a missing library. So the variable must stay unset if neither library works.
     """
     for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")):
         path = ctypes.util.find_library(library)
@@ -72,9 +72,9 @@ def off_screen_library() -> str | None:
 
 
 def choose() -> None:
-    """Set MUJOCO_GL on a machine without a display. If the user has set it, check its value instead. If the library that it
-    names is missing, switch off pictures with a warning: otherwise MuJoCo could not be imported, and most commands draw
-    nothing.
+    """Set MUJOCO_GL on a machine without a display. If the user has set the variable, check its value instead. If the library
+    that it names does not work, switch off pictures and print a warning. Then MuJoCo can still be imported for commands that
+    draw nothing.
 
     Raises:
         ConfigError: MuJoCo does not know the value of MUJOCO_GL.

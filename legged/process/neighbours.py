@@ -1,5 +1,5 @@
-"""Count of the trainings that share a device, for the report of each. Every training holds a file lock, which the others
-see.
+"""Count of the trainings that share a device. The report of a training states this number. Every training holds a file
+lock, by which the other trainings notice it.
 """
 
 import contextlib
@@ -15,13 +15,13 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts. Without it, two counting processes would take each other for trainings."""
+"""File that a process locks while it counts, so that only one counts at a time. Two would take each other for trainings."""
 PAUSE_S = 1.0
 """Shortest time between two counts during a training [s]."""
 
 
 class Neighbours:
-    """Counter of the other trainings on a device, of all users. Inside its `with` block the others can see this training.
+    """Counter of all users' other trainings on a device. Inside its `with` block the others can see this training.
 
     The system releases a lock when its process ends, even if the process is killed. Trainings of another machine, or of a
     container with separate temporary files, are not seen.
@@ -39,7 +39,7 @@ class Neighbours:
         self._looked_s = 0.0
 
     def __enter__(self) -> "Neighbours":
-        with contextlib.suppress(OSError):  # in a folder that can't be written, others do not see this training
+        with contextlib.suppress(OSError):  # if the folder can't be written, other trainings do not see this one
             for folder in (self._folder.parent, self._folder):
                 with contextlib.suppress(FileExistsError):
                     folder.mkdir()
@@ -50,7 +50,8 @@ class Neighbours:
             self._lock = os.fdopen(descriptor, "wb")
             os.chmod(name, 0o644)
             lock_descriptor(descriptor, blocking=False)
-            self._path = Path(name).rename(f"{name}{ENDING}")  # others look for this ending; the file is already locked
+            # Other trainings look for this ending. So the file gets it only after it is locked.
+            self._path = Path(name).rename(f"{name}{ENDING}")
         self.look()
         return self
 
@@ -61,12 +62,12 @@ class Neighbours:
             self._lock.close()
 
     def glance(self) -> None:
-        """Count the others, unless the last count was less than PAUSE_S ago."""
+        """Count the other trainings, unless the last count was less than PAUSE_S ago."""
         if time.monotonic() - self._looked_s >= PAUSE_S:
             self.look()
 
     def look(self) -> None:
-        """Count the others, and delete the files of trainings that were killed. Only one process does so at a time."""
+        """Count the other trainings, and delete the files of killed trainings. Do nothing while another process counts."""
         self._looked_s = time.monotonic()
         with contextlib.suppress(OSError), (self._folder / TURN).open("rb") as turn:
             if lock_descriptor(turn.fileno(), blocking=False):

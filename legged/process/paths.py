@@ -59,8 +59,8 @@ def reason(error: OSError) -> str:
 
 
 def full_disk_in(error: BaseException) -> OSError | None:
-    """Return the error of a full disk if it is `error` or one of its causes, else None. A library may have raised `error`
-    because of a full disk.
+    """Return the error of a full disk that is `error` or one of its causes, or None. A library may raise an error of its
+    own because of a full disk.
     """
     found: BaseException | None = error
     while found is not None:
@@ -91,7 +91,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove unfinished files for the same path that killed processes left."""
+    """Remove old temporary files for `path`. They are left over from killed processes."""
     temporary = re.compile(rf"\.{re.escape(path.stem)}\.\d+-\d+{re.escape(path.suffix)}")
     for other in path.parent.iterdir():
         with suppress(OSError):
@@ -114,7 +114,7 @@ def make_folder(folder: Path) -> None:
     """Make a folder and its missing parents.
 
     Raises:
-        ConfigError: a file has this path or a parent's, or the name is not a valid folder name.
+        ConfigError: `folder` or one of its parents is a file, or the name is not a valid folder name.
         RunError: the folder can't be made: the disk is full or read-only, or the parent belongs to another user.
     """
     try:
@@ -143,7 +143,7 @@ def ready_to_write(folder: Path, megabytes: float = 1.0) -> None:
     that its disk has `megabytes` free. Nothing is left behind.
 
     Raises:
-        ConfigError: a file has this path or a parent's, or the name is not a valid folder name.
+        ConfigError: `folder` or one of its parents is a file, or the name is not a valid folder name.
         RunError: the folder can't be written: the disk is full or read-only, or the folder belongs to another user.
     """
     if any("\0" in part or len(os.fsencode(part)) > LONGEST_NAME for part in folder.parts):

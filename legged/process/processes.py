@@ -19,12 +19,12 @@ POLL_S = 0.05
 PATIENCE_S = 10.0
 """Time in which a process must end after a signal [s]."""
 BUILT = "step captured"
-"""Last stage of a training's start-up that keeps the cores busy."""
+"""Name of the start-up stage after which a training no longer keeps the cores busy."""
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment for a child process in Python, which then imports this copy of the package. The child does not
-    report its start-up stages to the file of this process.
+    """Return the environment for a child process in Python, so that the child imports this copy of the package. STAGES_FILE
+    is left out, because the child must not report its start-up stages to the file of this process.
     """
     environment = {name: value for name, value in os.environ.items() if name != STAGES_FILE}
     top = Path(__file__).resolve().parents[2]

@@ -47,7 +47,7 @@ class Ranks:
 
 
 def _whole(name: str, default: int, least: int) -> int:
-    """Return a whole number from the environment, or `default` if it is missing or empty."""
+    """Return the whole number in the environment variable `name`, or `default` if the variable is missing or empty."""
     text = os.environ.get(name, "").strip()
     if not text:
         return default

@@ -1,4 +1,6 @@
-"""Set-up at the start of a process. It is imported before any large package, because imports take most of the start."""
+"""Set-up at the start of a process. This module is imported before any large package, because its settings must act during
+the imports, which take most of the start-up time.
+"""
 
 import atexit
 import gc
@@ -92,8 +94,8 @@ def program(command: str) -> list[str]:
 def only_lists() -> bool:
     """Return True if this process prints help or a list and needs no large import: `legged`, `legged --help`, `legged list`.
 
-    `python -m legged` counts too; at this moment its sys.argv[0] is still '-m'. An argument `-m legged` of another program
-    does not count.
+    `python -m legged` counts too; while it imports this package, its sys.argv[0] is still '-m'. An argument `-m legged` of
+    another program does not count.
     """
     given = sys.orig_argv
     module = sys.argv[:1] == ["-m"] and given[given.index("-m") + 1] == "legged"

@@ -29,7 +29,7 @@ COLLISION_SHAPES = 3
 INK = (40, 40, 40)
 """Default colour of text."""
 ON_A_PLANE = 130.0, -18.0
-"""Azimuth and elevation of the camera on a plane [degrees]."""
+"""Azimuth and elevation of the camera if the robots are on a plane [degrees]."""
 GLIDE, SMOOTH = 0.1, np.array([0.12, 0.12, 0.05])
 """For each picture, the point that the camera looks at moves towards the robot by this share of the distance: GLIDE on a
 plane, SMOOTH (x, y, z) on terrain. Small shares keep the robot's steps from shaking the picture.
@@ -41,7 +41,7 @@ FLATTEST, STEEPEST = -22.0, -70.0
 BEHIND, FRONT = 62.0, 118.0
 """Azimuths of the camera at a robot's side on terrain: a little behind the robot, and a little in front of it [degrees]."""
 AHEAD, DROP = 3.0, 0.1
-"""A robot is taken to walk down if the ground at a distance of AHEAD in front of it is lower by more than DROP [m]."""
+"""A robot counts as walking down if the ground at a distance of AHEAD in front of it is lower by more than DROP [m]."""
 CLEAR = 0.35
 """Smallest height of the line of sight above the ground, except near the robot [m]."""
 COMMANDED = (0.10, 0.75, 0.25, 1.0)
@@ -104,7 +104,7 @@ class Camera:
         return 0.5 * np.array([self.width, self.height]) + 0.5 * self.height / edge * across / depth[:, None]
 
     def add_shape(self, kind: mujoco.mjtGeom, color: Sequence[float], size: Any, pos: Any) -> mujoco.MjvGeom:
-        """Add a shape of MuJoCo's `size` (3,) to the next picture only, at `pos` (3,), world frame [m]. Return the shape."""
+        """Add a shape at `pos` (3,), world frame [m], to the next picture only; return it. `size` (3,) is as in MuJoCo."""
         scene = self.renderer.scene
         geom, rgba = scene.geoms[scene.ngeom], np.array(color, dtype=np.float32)
         mujoco.mjv_initGeom(geom, kind, np.array(size, dtype=float), np.array(pos, dtype=float), np.eye(3).ravel(), rgba)
@@ -154,7 +154,7 @@ def window_opens() -> bool:
         warnings.simplefilter("ignore")
         opens = bool(glfw.init())
     if opens:
-        glfw.terminate()  # because the viewer initialises GLFW itself, in another thread
+        glfw.terminate()  # the viewer initialises GLFW itself, in another thread
     return opens
 
 
@@ -261,8 +261,8 @@ class Follower:
 
 class RobotsCamera(Camera):
     """A camera for `count` robots of a task: the first ones, or those that `turn_to` selects. On a plane the robots are drawn
-    side by side, and the camera follows their middle. On terrain it follows robot number `followed` of them. Arrows show the
-    commanded and the actual velocity.
+    side by side, and the camera follows their middle. On terrain it follows one of them, the robot number `followed`. Arrows
+    show the commanded and the actual velocity.
     """
 
     def __init__(self, task: LeggedRobot, count: int, width: int = 960, height: int = 540) -> None:
@@ -278,7 +278,7 @@ class RobotsCamera(Camera):
         """(3,) sides of the box around a robot in its default pose [m]."""
         self.length = length = float(self.sides.max())
         self.centre = np.array([0.0, 0.0, 0.5 * self.sides[2]])
-        """(3,) point in the middle of a picture on a plane, relative to the ground below the middle of the robots [m]."""
+        """(3,) point that the camera looks at on a plane, relative to the ground below the middle of the robots [m]."""
         self.arrows = True
         """True if the arrows of the velocities are drawn."""
         self.ground = None if task.terrain is None else task.terrain.height_map
@@ -292,7 +292,8 @@ class RobotsCamera(Camera):
 
     def come_near(self, fill: float, glide: float) -> None:
         """Move the camera so close that the box around a robot in its default pose fills the share `fill` of the picture's
-        width or height. From then on the camera moves by the share `glide` of its distance to the robot per picture.
+        width or height. In each later picture, the point that the camera looks at moves towards the robot by the share
+        `glide` of the distance.
         """
         up = fill * np.tan(np.radians(0.5 * self.model.vis.global_.fovy))
         corners = 0.5 * self.sides * np.array(list(product((-1.0, 1.0), repeat=3)))
@@ -374,9 +375,9 @@ def drawn_model(task: BaseTask, width: int, height: int) -> mujoco.MjModel:
     """Return a copy of a task's model for pictures of `width` x `height` [pixels], without shadows and with wide planes."""
     model = copy.deepcopy(task.physics.model)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # makes rendering without a GPU ten times faster
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0  # 0 makes rendering without a GPU ten times faster
     # Planes are infinite in the simulation. They are drawn as large finite ones, with textures of the same scale, because
-    # MuJoCo shifts an infinite plane with the camera: two pictures of the same state would differ.
+    # MuJoCo shifts an infinite plane with the camera, so that two pictures of the same state differ.
     for plane in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
         half, material = model.geom_size[plane, :2], int(model.geom_matid[plane])
         if material >= 0 and (half > 0.0).all() and not model.mat_texuniform[material]:

@@ -24,7 +24,7 @@ SQUARE = 0.5
 """Side of a square of checkered ground [m]."""
 GROUND = "terrain_checker"
 LEVEL_RANGE = 0.9
-"""Colours change between minus and plus this height [m]. On checkered terrain the range includes all heights."""
+"""Heights between minus and plus this value differ in colour [m]. On checkered terrain the range includes all heights."""
 
 
 def add_sky(scene: mujoco.MjSpec) -> None:
@@ -45,7 +45,7 @@ def display_model(robot: Robot, count: int, width: int, height: int, terrain: Te
     scene = mujoco.MjSpec()
     look = scene.visual
     look.global_.offwidth, look.global_.offheight = width, height
-    look.quality.shadowsize = look.quality.offsamples = 0  # makes rendering without a GPU ten times faster
+    look.quality.shadowsize = look.quality.offsamples = 0  # 0 makes rendering without a GPU ten times faster
     look.map.zfar = 60
     scene.stat.extent, scene.stat.center = 4.0, [0, 0, 0.4]
     add_sky(scene)
@@ -83,7 +83,7 @@ def add_checker(scene: mujoco.MjSpec, name: str, one: list[float], other: list[f
 
 def add_painted_terrain(scene: mujoco.MjSpec, terrain: Terrain, checkered: bool = False) -> None:
     """Add a terrain without collisions, coloured by height. With `checkered`, level ground and slopes are checkered, so that
-    a camera's motion is visible. Steps are not, because this would make rendering a third slower.
+    a camera's motion is visible. Steps are plain, because checkered steps would make rendering a third slower.
     """
     span, lowest = LEVEL_RANGE, float(terrain.height_map.corners.min())
     if checkered:

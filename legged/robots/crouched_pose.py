@@ -1,4 +1,4 @@
-"""The crouched pose, with the feet pulled below the base, that a fallen robot takes before it stands up."""
+"""Crouched pose that a fallen robot takes before it stands up. The feet are pulled below the base."""
 
 import numpy as np
 

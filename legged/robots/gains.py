@@ -1,8 +1,8 @@
 """Rule for the gains of a robot whose file states none. Gains follow from the inertia that each joint moves, and from the
 weight that the joint carries.
 
-Two inertias matter. With the robot in the air, a joint moves the links behind it against the rest of the robot. With the feet
-on the ground, the same joint moves the base as well.
+Two inertias matter. With the robot in the air, a joint moves its child links against the rest of the robot. With the feet on
+the ground, the same joint moves the base as well.
 
 P gains give the first inertia the natural frequency FREQUENCY sqrt(g / h), where h is the robot's standing height. They are
 raised until no joint gives way under the robot's weight. D gains give the geometric mean of the two inertias the damping
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 FREQUENCY = 6.0
-"""Natural frequency of a joint in the air, times sqrt(h / g) [1]. It is 4 Hz for a robot that stands h = 0.5 m high."""
+"""Natural frequency of a joint in the air, times sqrt(h / g) [1]. The frequency is 4 Hz for a standing height h = 0.5 m."""
 RATIO = 0.5
 """Damping ratio [1]."""
 SAG = 0.25
@@ -50,9 +50,9 @@ def gains(
 
     `qpos` is the pose in which the robot stands, `feet` are the shapes (ids) that it stands on, `effort` (D,) the motors'
     torque limits [N m], and `height` the base's height above the ground [m]. `rolling` (D,) holds the largest speed of each
-    wheel [rad/s], and 0 for other joints. A wheel's stiffness is a gain on its speed [N m s/rad], and its damping is 0. An
-    error as large as the largest speed demands the whole torque. The gain is smaller if the explicit law would otherwise be
-    unstable in the air.
+    wheel [rad/s], and 0 for other joints. A wheel's stiffness is a gain on its speed [N m s/rad], and its damping is 0. A
+    speed error as large as the largest speed demands the whole torque. The gain is smaller if the explicit law would
+    otherwise be unstable in the air.
     """
     data, inverse = _inverse_inertia(model, qpos)
     dofs = model.jnt_dofadr[list(joints)]
@@ -86,8 +86,8 @@ def inertia_in_air(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int
 
 
 def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return the torques (D,) [N m] with which the hinges `joints` (ids) hold the robot at rest in the pose `qpos`. Of the
-    ground forces on the shapes `feet` (ids) that balance the weight, those with the least sum of squares are assumed.
+    """Return the torques (D,) [N m] with which the hinges `joints` (ids) hold the robot at rest in the pose `qpos`. The
+    ground forces on the shapes `feet` (ids) balance the weight, and their sum of squares is the least possible.
     """
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -120,6 +120,6 @@ def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarr
 
 
 def _static_torques(data: mujoco.MjData, jacobian: np.ndarray) -> np.ndarray:
-    """Return the generalised forces (V,) that hold the robot at rest (see `standing_torques`); `jacobian` is the feet's."""
+    """Return the generalised forces (V,) that hold the robot at rest (see `standing_torques`). `jacobian` is of the feet."""
     forces = np.linalg.lstsq(jacobian[:, :6].T, data.qfrc_bias[:6], rcond=None)[0]
     return np.asarray(data.qfrc_bias - jacobian.T @ forces)

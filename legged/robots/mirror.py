@@ -21,12 +21,12 @@ class Mirror:
     joints: tuple[int, ...]
     """(D,) for each joint, the index of the joint whose angle it takes in the mirrored robot."""
     signs: tuple[float, ...]
-    """(D,) sign with which each joint takes its partner's angle, 1 or -1."""
+    """(D,) signs, 1 or -1. In the mirrored robot, a joint's angle is its sign times its partner's angle."""
     feet: tuple[int, ...]
     """(F,) for each foot, the index of the foot whose place it takes in the mirrored robot."""
     passive: tuple[int, ...] = ()
-    """(P,) partners of passive hinges and slides; `passive_signs` (P,) are their signs. Both are empty if a partner is
-    missing.
+    """(P,) partners of passive hinges and slides; `passive_signs` (P,) are their signs. Both tuples are empty if
+    one of these joints has no partner.
     """
     passive_signs: tuple[float, ...] = ()
 
@@ -66,8 +66,8 @@ def _joint_partners(
 ) -> tuple[list[int] | None, tuple[float, ...]]:
     """Return the partners and the signs of hinges and slides; None and () if any of them lacks a partner."""
     anchors, axes = data.xanchor[list(joints)], data.xaxis[list(joints)]
-    # Joints of a hip may have the same anchor. Their axes tell them apart, by the absolute values of the components, which
-    # a reflection does not change.
+    # Joints of a hip may have the same anchor, but their axes differ. A reflection does not change the absolute values of
+    # an axis's components.
     partners = _partners(np.hstack([anchors, np.abs(axes)]), np.hstack([anchors * FLIP, np.abs(axes)]))
     if partners is None:
         return None, ()

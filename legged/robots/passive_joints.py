@@ -1,4 +1,4 @@
-"""Joints without a motor. Their positions follow from springs and closed loops at given angles of the driven joints."""
+"""Joints without a motor. Springs and closed loops determine where these joints are at given angles of the driven joints."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ import numpy as np
 from legged.errors import ConfigError
 
 STEPS = 8
-"""Number of steps in which driven joints are moved to their angles, so that loops stay nearly closed."""
+"""Number of steps in which the driven joints move to their target angles. The loops stay nearly closed in small steps."""
 ITERATIONS = 30
-"""Iterations of Newton's method in each step."""
+"""Largest number of iterations of Newton's method in each step."""
 LARGEST_STEP = 0.3
 """Largest change of a coordinate in one iteration [rad] or [m]."""
 CLOSED = 1e-6
-"""Largest error of a closed loop [m] or [rad]."""
+"""Error up to which a loop counts as closed [m] or [rad]."""
 LEAST_STIFFNESS = 1e-3
-"""Stiffness assumed for joints without a spring, as a share of the stiffest spring's. It holds joints that no loop moves."""
+"""Least stiffness that is assumed for a joint, as a share of the largest. It holds joints that have no spring or loop."""
 TRIES = 20
-"""Largest number of random poses that are tried for each pose that is needed."""
+"""`draw` tries at most this many random poses for each pose that it returns."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PassiveJoints:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, driven: Sequence[int], passive: Sequence[int]) -> "PassiveJoints":
-        """Return the passive joints of a model. `driven` and `passive` are the ids of all its joints except the base's."""
+        """Return the passive joints of a model. `driven` and `passive` (ids) are all joints except the base's."""
         simple = [i for i in passive if model.jnt_type[i] != mujoco.mjtJoint.mjJNT_BALL]
         return cls(
             model=model,
@@ -55,8 +55,8 @@ class PassiveJoints:
         the least spring energy. Return None if the loops do not close at these angles.
 
         The driven joints are moved from `start` in steps. In each step, [K J'; J 0] [dq; l] = [-g; -c] is solved repeatedly
-        for the changes dq and the multipliers l. K is the stiffness, g the gradient of the spring energy, and J and c are the
-        Jacobian and the errors of the loops. Gravity is left out.
+        for the changes dq of the passive joints and the Lagrange multipliers l. K is the stiffness, g the gradient of the
+        spring energy, and J and c are the Jacobian and the errors of the loops. Gravity is neglected.
         """
         model, data = self.model, mujoco.MjData(self.model)
         columns = model.jnt_qposadr[list(self.driven)]
@@ -88,7 +88,7 @@ class PassiveJoints:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        mujoco.mj_makeConstraint(self.model, data)  # without contacts, because no collisions were computed
+        mujoco.mj_makeConstraint(self.model, data)  # makes no contacts, as no collisions were computed
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
         if len(rows):
@@ -119,7 +119,7 @@ class PassiveJoints:
         random numbers from `factor`. Poses with open loops, or with passive joints beyond their ranges, are rejected.
 
         Raises:
-            ConfigError: too few poses are possible; `where` is the place of `factor` in the configuration.
+            ConfigError: too few random poses are valid; `where` is the place of `factor` in the configuration.
         """
         random, columns = np.random.default_rng(seed), self.model.jnt_qposadr[list(self.driven)]
         poses: list[np.ndarray] = []
@@ -135,18 +135,20 @@ class PassiveJoints:
 def default_qpos(
     model: mujoco.MjModel, driven: Sequence[int], angles: np.ndarray, passive: PassiveJoints | None, where: str
 ) -> np.ndarray:
-    """Return generalised positions (nq,) with the base level at the origin, the joints `driven` (ids) at `angles` (D,), and
-    the passive joints where springs and loops put them.
+    """Return generalised positions (nq,) for a level base at the origin. The joints `driven` (ids) are at `angles` (D,), and
+    springs and loops determine the positions of the passive joints.
 
     Raises:
-        ConfigError: the loops do not close at those angles; `where` is the place of the angles in the configuration.
+        ConfigError: at these angles the loops do not close, or passive joints are beyond their ranges. `where` is the place
+            of the angles in the configuration.
     """
     qpos = model.qpos0.copy()
     qpos[:7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
     if passive is None:
         qpos[model.jnt_qposadr[list(driven)]] = angles
         return qpos
-    for i in (*driven, *passive.numbers):  # start inside the ranges, because a linkage may close in two ways
+    # Some linkages can close in two ways. A start within the joints' ranges leads to the way that the ranges allow.
+    for i in (*driven, *passive.numbers):
         if model.jnt_limited[i]:
             qpos[model.jnt_qposadr[i]] = np.clip(qpos[model.jnt_qposadr[i]], *model.jnt_range[i])
     settled = passive.settle(angles, qpos)

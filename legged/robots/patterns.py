@@ -23,7 +23,7 @@ def match_names(patterns: Sequence[str], names: Sequence[str], where: str) -> tu
 
 
 def match_values(table: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
-    """Return (len(names),) values, for each name the value of the longest pattern that the name contains.
+    """Return one value for each name, (len(names),). It is the value of the longest pattern that the name contains.
 
     Raises:
         ConfigError: a pattern matches no name, or no pattern matches a name.

@@ -23,7 +23,7 @@ from legged.robots.shapes import Shapes
 from legged.robots.stance import standing_height, swinging_joints
 
 SLACK = 1e-3
-"""Largest distance of a default angle from its joint's range that counts as rounding [rad]."""
+"""A default angle may be this far outside the range of its joint, because angles are rounded [rad]."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class RobotFile:
     feet: tuple[str, ...] = field(metadata=NAMES)
     """Patterns of the feet's shapes. All of these shapes on one body form one foot."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]; an empty table leaves the gains to a rule by inertia and weight (gains.py)."""
+    """Joint-name pattern -> P gain [N m/rad]; if the table is empty, gains.py computes them from inertia and weight."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> D gain [N m s/rad]; an empty table leaves the gains to the rule in gains.py."""
+    """Joint-name pattern -> D gain [N m s/rad]; if the table is empty, gains.py computes the gains."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))
     """Joint-name pattern -> largest joint speed [rad/s]; an empty table means 30 for all joints."""
     penalize_contacts_on: tuple[str, ...] = ()
@@ -51,17 +51,17 @@ class RobotFile:
     terminate_after_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact ends the episode."""
     passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Patterns of the joints without a motor: springs, rods, parts of closed loops. Slides and balls are allowed."""
+    """Patterns of the joints without a motor, e.g. of springs and closed loops. Slides and balls are allowed."""
     wheels: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints that turn wheels. Their angles have no meaning: they are neither observed nor rewarded."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Properties of a robot that a task uses. It has D joints with a motor, in the order of the model, P passive hinges and
-    slides, S collision shapes, F feet and B contacts. "Joint" means a joint with a motor unless stated otherwise.
+    """A robot's properties, as tasks use them. The robot has D joints with a motor (in the order of the model), P passive
+    hinges and slides, S collision shapes, F feet and B contacts. "Joint" means a joint with a motor unless stated otherwise.
 
-    A contact is a collision shape, or all shapes of a foot together, for which one contact force is computed.
+    A "contact" is one collision shape, or all shapes of a foot together. One contact force is computed for each contact.
     """
 
     name: str
@@ -93,10 +93,10 @@ class Robot:
     """(D,) column of each joint in MuJoCo's generalised positions; `qvel_columns` are the columns in the velocities."""
     qvel_columns: tuple[int, ...]
     passive: PassiveJoints | None
-    """Joints without a motor; None if every joint has one."""
+    """Joints without a motor; None if every joint has a motor."""
     default_qpos: np.ndarray
-    """(nq,) MuJoCo's generalised positions at action 0, with the base level at the origin and passive joints where springs
-    and loops put them.
+    """(nq,) MuJoCo's generalised positions at action 0, for a level base at the origin. Springs and loops determine the
+    positions of the passive joints.
     """
     shape_names: tuple[str, ...]
     """Names of the S collision shapes, in the order of the model."""
@@ -107,8 +107,8 @@ class Robot:
     feet_shapes: tuple[tuple[str, ...], ...]
     """(F,) names of the shapes of each foot."""
     feet_indices: tuple[int, ...]
-    """(F,) indices of the feet among the contacts. `penalised_indices` and `termination_indices` are those of the contacts
-    that are penalised and that end an episode.
+    """(F,) indices of the feet among the contacts. `penalised_indices` are those of the contacts that the `collision`
+    reward counts, and `termination_indices` those of the contacts that end an episode.
     """
     penalised_indices: tuple[int, ...]
     termination_indices: tuple[int, ...]
@@ -155,7 +155,7 @@ class Robot:
 
 
 def load_robot(name: str, where: str = "robot") -> Robot:
-    """Return the robot in the folder `name` under resources/robots/, else in the folder with the path `name`. `where` is the
+    """Return the robot in resources/robots/`name` or, if there is none, in the folder with the path `name`. `where` is the
     place of the name in the configuration, for error messages.
 
     Raises:
@@ -238,9 +238,9 @@ def _folder(name: str, where: str) -> Path:
     for folder in (robots / name, Path(name)):
         if exists(folder / "robot.yaml"):
             return folder.resolve()
-    if len(Path(name).parts) > 1:  # perhaps a folder of another machine, on which a run was made
+    if len(Path(name).parts) > 1:  # the path may be from a run on another machine
         raise ConfigError(
-            f"{where}: there is no robot {shown(name)}: that folder has no robot.yaml. "
+            f"{where}: there is no robot {shown(name)}, because that folder has no robot.yaml. "
             "If the robot was moved, give its new folder: robot=FOLDER"
         )
     raise ConfigError(f"{where}: there is no robot {shown(name)}{known}")

@@ -19,7 +19,7 @@ GROUPS = 31
 LARGEST_NUMBER = 1e12
 """Largest number allowed in a model. Larger numbers may overflow in float32, with which GPUs compute."""
 NUMBERS = ("qpos0", "qpos_spring", "body_", "jnt_", "dof_", "geom_", "site_", "actuator_", "mesh_", "eq_", "tendon_")
-"""Prefixes of the names of a model's arrays of numbers."""
+"""`read_model` checks the numbers in the model's arrays whose names begin with one of these texts."""
 
 
 def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
@@ -38,7 +38,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
             model = robot_spec_of(path).compile()
     except ConfigError as error:
         raise ConfigError(f"{where}: model: {error}") from error
-    except Exception as error:  # MuJoCo's errors have no class of their own
+    except Exception as error:  # MuJoCo raises errors of several classes
         raise ConfigError(f"{at}: MuJoCo refuses it: {' '.join(str(error).split())}") from error
     if warnings:
         raise ConfigError(f"{at}: MuJoCo warns: {' '.join(warnings[0].split())}")
@@ -57,7 +57,7 @@ def read_model(folder: Path, file: str, where: str) -> mujoco.MjModel:
         raise ConfigError(f"{at}: option actuatorgroupdisable: group {group} has motors and must not be disabled")
     for flag in ("SLEEP", "IPC"):
         if model.opt.enableflags & getattr(mujoco.mjtEnableBit, f"mjENBL_{flag}"):
-            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; leave it out: its state is not kept per robot")
+            raise ConfigError(f"{at}: option flag: {flag.lower()} is enabled; remove it, as its state is not kept per robot")
     return model
 
 
@@ -79,8 +79,9 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[str] = ()) -> None:
-    """Check the conditions that engines rely on. The first joint is the base's free joint, and all others come after it. Each
-    joint that no pattern in `passive` matches is a hinge with one motor, in the same order. Collision shapes have names.
+    """Check the conditions that engines rely on. The first joint is the base's free joint. Each later joint is passive (a
+    pattern in `passive` matches its name) or is a hinge with one motor. Motors are in the order of their hinges. Collision
+    shapes have names.
 
     Raises:
         ConfigError: a condition is not met; the message begins with `where`.
@@ -106,12 +107,12 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
 
 
 def aimless_shapes(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return one line with the collision shapes whose own bits would not let them collide with the ground, or no line. The
-    task replaces the bits of all collision shapes, so that they collide with the ground.
+    """Return one line that names the collision shapes whose contype and conaffinity exclude contacts with the ground, or no
+    line. The task replaces contype and conaffinity, so that all collision shapes collide with the ground.
     """
     touched, meets = model.geom_contype | model.geom_conaffinity, (model.geom_contype & 1) | (model.geom_conaffinity & 3)
     names = [model.geom(int(i)).name for i in np.flatnonzero((touched != 0) & (meets == 0))]
-    said = "shapes collide with the ground, although their own collision bits would not allow it"
+    said = "shapes collide with the ground, although their contype and conaffinity exclude it"
     return (f"{said}: {', '.join(names)[:200]}",) if names else ()
 
 
@@ -124,7 +125,7 @@ def passive_joints(model: mujoco.MjModel, patterns: Sequence[str], where: str) -
     """Return the ids of the passive joints, whose names the patterns match. The base's joint is never passive.
 
     Raises:
-        ConfigError: a pattern is in no joint's name; `where` is the file of the patterns.
+        ConfigError: a pattern matches no joint's name; `where` is the file of the patterns.
     """
     names = [model.joint(i).name for i in range(1, model.njnt)]
     return [1 + i for i in match_names(patterns, names, f"{where}: passive_joints")]
@@ -151,7 +152,7 @@ def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], wher
         raise ConfigError(f"{where}: base: the free joint is on '{bodies[model.jnt_bodyid[0]]}', not on '{base}'")
     for i in joints:
         if not model.joint(i).name:
-            raise ConfigError(f"{where}: model: every hinge needs a name; one of '{bodies[model.jnt_bodyid[i]]}' has none")
+            raise ConfigError(f"{where}: model: hinges need names; one of body '{bodies[model.jnt_bodyid[i]]}' has none")
 
 
 def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -> None:

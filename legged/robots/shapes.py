@@ -30,7 +30,7 @@ class Shapes:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, feet: Sequence[str], where: str) -> "Shapes":
-        """Return the shapes of a model. The patterns `feet` name the feet's shapes; those of one body form one foot.
+        """Return the shapes of a model. The patterns `feet` match the feet's shapes. All of these on one body form one foot.
 
         Raises:
             ConfigError: a pattern matches neither shape nor body; `where` is the place of the patterns.
@@ -56,16 +56,16 @@ class Shapes:
         )
 
     def contacts(self, patterns: Sequence[str], where: str) -> tuple[int, ...]:
-        """Return the sorted indices of the contacts that have a shape named by the patterns. Raises the errors of `of`."""
+        """Return the sorted indices of the contacts of all shapes that `patterns` match. Raises the error of `Shapes.of`."""
         return tuple(sorted({self.contact[i] for i in match_shapes(patterns, self.names, self.bodies, where)}))
 
 
 def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence[str], where: str) -> tuple[int, ...]:
-    """Return the indices, in ascending order, of the shapes that the patterns name. A pattern names all shapes whose names
-    contain it. If no name contains it, the pattern names all shapes of the bodies whose names contain it.
+    """Return the indices, in ascending order, of the shapes that the patterns match. A pattern matches all shapes whose
+    names contain it. If there is no such shape, the pattern matches all shapes of the bodies whose names contain it.
 
     Raises:
-        ConfigError: a pattern is in no name; `where` is the place of the patterns.
+        ConfigError: a pattern matches no shape; `where` is the place of the patterns.
     """
     found: set[int] = set()
     for pattern in patterns:

@@ -33,11 +33,11 @@ def size_of(name: str, where: str = "robot") -> Size:
 
 
 def growth(reference: Size, robot: Size) -> dict[str, float]:
-    """Return the factors on masses ("kg"), lengths ("m") and times ("s") from the robot `reference` to `robot`."""
+    """Return the ratios of masses ("kg"), lengths ("m") and times ("s") of `robot` to those of `reference`."""
     length = robot.height / reference.height
     return {"kg": robot.mass / reference.mass, "m": length, "s": sqrt(length)}
 
 
 def grown(unit: str, reference: Size, robot: Size) -> float:
-    """Return the factor on a quantity in `unit`, such as "m/s" or "N^2 m^2", from the robot `reference` to `robot`."""
+    """Return the factor that converts a number in `unit`, such as "m/s" or "N^2 m^2", from `reference` to `robot`."""
     return factor(unit, growth(reference, robot))

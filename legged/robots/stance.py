@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 ALONG = 0.7
-"""Least |y|, base frame, of the unit axis of a joint that swings a leg forward: the axis is within 45 degrees of y."""
+"""A joint swings a leg forward if |y| of its unit axis (base frame) exceeds this. The axis is then within 45 degrees of y."""
 
 
 def stance(model: mujoco.MjModel, qpos: np.ndarray) -> mujoco.MjData:
@@ -47,9 +47,9 @@ def standing_height(model: mujoco.MjModel, base: str, qpos: np.ndarray) -> float
 
 
 def swinging_joints(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[int], feet: Sequence[int]) -> np.ndarray:
-    """Return (D,) True for each of the hinges `joints` (ids) that swings a leg forward and back: at hip, knee and ankle.
+    """Return (D,) True for each hinge of `joints` (ids) that swings a leg forward and back, as hip, knee and ankle do.
 
-    Each of these hinges lies between the base and one of the shapes `feet` (ids), and its axis points sideways in the pose
+    Such a hinge lies between the base and one of the shapes `feet` (ids), and its axis points sideways in the pose
     `qpos`, in which the base is level.
     """
     data = stance(model, qpos)

@@ -1,7 +1,8 @@
 """One robot in C MuJoCo, with sensors and with the motor model of training. Commands may arrive at any time.
 
-`legged.mdp.actuator` has the same formulas for thousands of robots with one command per control step. For one robot, the
-formulas take 0.1 ms per physics step in torch, but 0.02 ms in numpy. MuJoCo's own step takes about 0.02 ms too.
+`legged.mdp.actuator` computes the motors of thousands of robots in torch, with one command per control step. This file has
+the same formulas in numpy. For one robot they take 0.02 ms per physics step, but 0.1 ms in torch. MuJoCo's own step takes
+about 0.02 ms.
 """
 
 from collections import deque
@@ -25,24 +26,24 @@ from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 OFFERS = frozenset({"base_lin_vel", "heights"})
-"""Additional sources of observations. The simulator knows them; a real robot would have to estimate them."""
+"""Observations that the simulator knows. A real robot has no sensors for them and would have to estimate them."""
 UNSTABLE = [int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}")) for name in ("QPOS", "QVEL", "QACC")]
 """MuJoCo's warnings that a state is unstable, after which MuJoCo resets the state."""
 FALLEN = 1.2
-"""Tilt of the base above which the robot has fallen [rad]."""
+"""The robot has fallen if its base tilts by more than this [rad]."""
 OURS = "control.actuator"
-"""Section of a configuration about the motors."""
+"""Section of the configuration that sets the motors."""
 
 
 def motors_config(
     robot: Robot, contract: Contract | None, ideal: bool, changes: Iterable[tuple[str, Any]], dt: float
 ) -> tuple[ActuatorConfig, float]:
-    """Return the configuration of the motors, and the time unit of their delay [s]. The motors are ideal, or those of the
-    training of `contract` if it is given and `ideal` is False. Then `changes` to control.actuator are made. The time unit is
-    the training's physics step, or `dt` without a contract.
+    """Return the configuration of the motors, and the time unit of their delay [s]. The motors are those with
+    which the policy of `contract` was trained, or ideal ones without a contract or if `ideal` is True. Then `changes` to
+    control.actuator are made. The time unit is the physics step of the training, or `dt` [s] without a contract.
 
     Raises:
-        ConfigError: a change concerns another section, or the motors do not fit the robot or the step.
+        ConfigError: a change concerns another section, or the motors do not fit the robot or the physics step.
     """
     changes = list(changes)
     for key, _ in changes:
@@ -81,7 +82,7 @@ class Motors:
         self._varies = cfg.delay_varies
         self.delay = self._draw()
         """Present delay of a command [steps]."""
-        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # the last arrived command, then later ones
+        self._past: deque[np.ndarray] = deque([np.zeros((3, robot.num_dof))])  # the arrived command, then the delayed ones
         self._network: ActuatorNetwork | None = None
         if cfg.network:
             weights = NetworkWeights.load(cfg.network)
@@ -182,7 +183,7 @@ class SimulatedRobot:
         self.steepest = max(self.steepest, float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0))))
 
     def state(self, sources: Mapping[str, np.ndarray | None]) -> Reading:
-        """Return the present measurements and the requested `sources`. The value of `heights` is its points (P, 2) [m]."""
+        """Return the present measurements and the requested `sources` (name -> points (P, 2) [m] or None)."""
         data = self.data
         return Reading(
             time=float(data.time),
@@ -196,7 +197,7 @@ class SimulatedRobot:
         )
 
     def _source(self, name: str, points: np.ndarray | None) -> np.ndarray:
-        """Return a source in the form of `legged.deploy.interface.Reading.sources`."""
+        """Return the value of a source, as described at `legged.deploy.interface.Reading.sources`."""
         position, entries = self.data.qpos[:3], np.zeros(9)
         mujoco.mju_quat2Mat(entries, self.data.qpos[3:7])
         rotation = entries.reshape(3, 3)
@@ -211,7 +212,7 @@ class SimulatedRobot:
         return self._scan[self._terrain.height_map.index(*places.T)] - position[2]
 
     def report(self) -> dict[str, float | bool]:
-        """Return the distances moved [m], the largest lean [rad], and whether the robot fell."""
+        """Return the time [s], distances moved and base heights [m], the largest lean [rad], and whether the robot fell."""
         moved = self.data.qpos[:3] - self._start
         return {
             "time": float(self.data.time),

@@ -18,11 +18,11 @@ POSE_S = 0.04
 """Interval between the poses that are kept for a film [s]. At most `MOST_POSES` poses are kept."""
 MOST_POSES = 750
 SOURCE_S = 0.02
-"""Interval between states that include the sources, rounded to whole intervals of states [s]."""
+"""Interval between states that include the sources [s], rounded to a multiple of the interval between states."""
 HOLD_S = 0.2
 """Time without a command after which motors brake with their present D gains [s]."""
 BEHIND_S = 0.1
-"""Largest lag of the simulated time behind real time that the simulation makes up for [s]."""
+"""Largest lag behind real time that the simulation catches up with [s]. It skips a larger lag."""
 
 
 class Link:
@@ -68,7 +68,7 @@ class Server:
         self._told: float | None = None
         self._gone = False
         self.skipped_s = 0.0
-        """Sum of the lags that the simulation did not make up for [s]."""
+        """Sum of the lags behind real time that the simulation skipped [s]."""
 
     def run(self, seconds: float) -> dict[str, float | bool]:
         """Run until the client says goodbye, but at most for `seconds`. Return the robot's report and the counts of packets.
@@ -111,7 +111,7 @@ class Server:
         while True:
             try:
                 data, client = self._socket.recvfrom(udp.LARGEST)
-            except OSError:  # no more packets, or the receiver has closed
+            except OSError:  # there are no more packets, or the client has closed its socket
                 break
             kind, sequence, body = udp.open_packet(data) or (None, 0, b"")
             if kind == udp.HELLO:
@@ -121,7 +121,7 @@ class Server:
                         self._newest = 0
                     self._client = client  # this client receives the states from now on
                     self._socket.sendto(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)), client)
-            elif client == self._client and kind == udp.BYE:  # a goodbye is never lost, so the simulation ends
+            elif client == self._client and kind == udp.BYE:  # no loss is simulated here, so that the run always ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
                 self._in.put(now, (sequence, body))
@@ -140,5 +140,5 @@ class Server:
         """Send the packets whose latency has passed."""
         for data in self._out.take(now):
             if self._client is not None:
-                with suppress(OSError):  # the receiver has closed
+                with suppress(OSError):  # the client may have closed its socket
                     self._socket.sendto(data, self._client)

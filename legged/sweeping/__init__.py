@@ -1,1 +1,1 @@
-"""Sweeps: many trainings that differ in a few settings, chosen from the results of earlier ones."""
+"""Sweeps: many trainings that differ in a few settings. Results of earlier trainings guide the choice of the settings."""

@@ -45,10 +45,10 @@ class ObjectiveConfig:
     """The objective of a sweep."""
 
     figure: str = ""
-    """Figure of the evaluations during training; empty for the most important one."""
+    """Name of a figure that evaluations during training measure; empty for the most important figure."""
     take: Literal["last", "best", "time", "steps"] = "last"
-    """Value of a trial: the figure's last or best value, or the training time [s] or the steps of all robots until the figure
-    reaches `target`."""
+    """Value of a trial: the last or best value of the figure, or the cost of reaching `target`. The cost is the training
+    time [s] or the number of steps of all robots."""
     target: float | None = field(default=None, metadata=NUMBER)
     """Value of the figure at which a trial ends."""
 
@@ -58,9 +58,9 @@ class SweepConfig:
     """The file of a sweep."""
 
     task: str = ""
-    """Task to train: a name, or a YAML file relative to this one."""
+    """Task to train: a name, or a YAML file with a path relative to the sweep's file."""
     name: str = field(default="", metadata=NAME)
-    """Folder under logs/; by default sweep_ and the name of the file."""
+    """Folder under logs/; by default sweep_ followed by the name of the sweep's file."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
     """Number of trials of all processes together."""
     seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
@@ -68,7 +68,7 @@ class SweepConfig:
     objective: ObjectiveConfig = ObjectiveConfig()
     """The objective."""
     pruner: Literal["median", "hyperband", "none"] = "median"
-    """Rule for ending trials early: below the median of earlier trials, by successive halving, or never."""
+    """Rule that ends trials early: if they are worse than the median of earlier trials, by successive halving, or never."""
     startup_trials: int = field(default=10, metadata=between(1, 1_000_000))
     """Number of random trials before earlier results guide the search."""
     seed: int = field(default=1, metadata=between(0, 2**31 - 1))
@@ -90,7 +90,7 @@ class Parameter:
     """Optuna's distribution: of whole numbers, of real numbers, or of choices as JSON texts."""
 
     def value(self, drawn: Any) -> Any:
-        """Return the setting's value for a number that Optuna drew, rounded to four digits, or for the text of a choice."""
+        """Return the setting's value for `drawn`, the number or text that Optuna sampled. Real numbers get four digits."""
         if isinstance(drawn, str):
             return json.loads(drawn)
         if isinstance(drawn, int):
@@ -98,7 +98,7 @@ class Parameter:
         return min(max(float(f"{drawn:.4g}"), self.distribution.low), self.distribution.high)
 
     def drawn(self, value: Any) -> Any:
-        """Return what Optuna would draw for a value of the setting; None if the value is not among those to try."""
+        """Return the number or text that Optuna would sample for a value of the setting; None if the value is not tried."""
         if hasattr(self.distribution, "choices"):
             return next((text for text in self.distribution.choices if json.loads(text) == value), None)
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -121,18 +121,18 @@ class Plan:
 
     @property
     def own(self) -> dict[str, Any]:
-        """Dotted path -> the task's own value of each swept setting."""
+        """Dotted path of each swept setting -> the task's own value."""
         task = to_dict(self.cfg)
         return {one.path: value_at(task, one.path) for one in self.parameters}
 
     @property
     def own_drawn(self) -> dict[str, Any]:
-        """Dotted path -> `Parameter.drawn` of the task's own value, for each swept setting."""
+        """Dotted path of each swept setting -> `Parameter.drawn` of the task's own value."""
         own = self.own
         return {one.path: one.drawn(own[one.path]) for one in self.parameters}
 
     def settings(self, drawn: Mapping[str, Any]) -> dict[str, Any]:
-        """Return dotted path -> value of a trial's settings. `drawn` has the numbers and texts that Optuna has drawn."""
+        """Return the swept settings of a trial, dotted path -> value. `drawn` maps dotted paths to what Optuna sampled."""
         return {one.path: one.value(drawn[one.path]) for one in self.parameters if one.path in drawn}
 
     @property
@@ -152,8 +152,8 @@ class Plan:
 
     @property
     def negated(self) -> bool:
-        """True if figures are reported to Optuna with the opposite sign. Optuna then minimises the time or the steps to a
-        target, but a larger figure is better.
+        """True if figures are reported to Optuna with the opposite sign. This is so if Optuna minimises the time or the
+        steps to a target, but a larger figure is better.
         """
         return self.until_target and not lower_is_better(self.figure)
 
@@ -177,7 +177,7 @@ class Plan:
 
     def arguments(self, values: Mapping[str, Any], number: int, seed: int) -> list[str]:
         """Return the arguments of `legged train` for trial `number`. They switch on evaluations, to compare the trials.
-        They switch off report and film, because these take longer than many trials; `legged runs report` makes them later.
+        They switch off report and film, which often take longer than a trial; `legged runs report` can make them later.
         """
         runner, target = self.cfg.train.runner, self.given.objective.target
         settings = {
@@ -200,7 +200,7 @@ class Plan:
 
 
 def sweep_file(text: str) -> Path:
-    """Return the file of a sweep: a path, or the name of one in cfg/sweeps of this package.
+    """Return the file of a sweep. `text` is its path, or the name of a sweep in cfg/sweeps of this package.
 
     Raises:
         ConfigError: there is no such file.
@@ -221,7 +221,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
         ConfigError: Optuna is missing, a setting is unknown, a value is out of bounds, or the objective is not measured.
     """
     if find_spec("optuna") is None:
-        raise ConfigError("sweep: needs the package optuna, which is not installed here: pip install optuna")
+        raise ConfigError("sweep: the package optuna is not installed; run `pip install optuna`")
     given = build(SweepConfig, read_yaml(path), "", Origins(), str(path))
     given = given if trials is None else replace(given, trials=trials)
     name = given.name or f"sweep_{path.stem}"
@@ -234,7 +234,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     for section in ("overrides", "parameters"):
         for key in getattr(given, section):
             if key in OWN or key.startswith(f"{OWN[-1]}."):
-                raise ConfigError(f"{path}: {section}: {key}: leave it out; the sweep sets it (from seeds, name, objective)")
+                raise ConfigError(f"{path}: {section}: {key}: leave it out; the sweep sets it from seeds, name or objective")
     named = relative(path.parent / given.task) if given.task.endswith(YAML_ENDINGS) else given.task
     task = register_file(named, f"{path}: task") if named.endswith(YAML_ENDINGS) else named
     with _said_in(path, "overrides"):
@@ -244,14 +244,15 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     if not runner.evaluate_interval:
         changes.append(("train.runner.evaluate_interval", max(1, runner.max_iterations // EVALUATIONS)))
     if "train.runner.evaluate_share" not in given.overrides:
-        changes.append(("train.runner.evaluate_share", 1.0))  # skip no evaluation: trials are compared at equal iterations
+        # All evaluations are made, because trials are compared at equal iterations.
+        changes.append(("train.runner.evaluate_share", 1.0))
     cfg = override(cfg, changes)
     parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())
     figures, objective = evaluated_figures(task_class(task), cfg), given.objective
     figure = objective.figure or figures[0]
     if figure not in figures:
-        known = suggest(figure, figures, "they find")
-        raise ConfigError(f"{path}: objective.figure: evaluations of '{cfg.task}' find no {shown(figure)}{known}")
+        known = suggest(figure, figures, "they measure")
+        raise ConfigError(f"{path}: objective.figure: evaluations of '{cfg.task}' do not measure {shown(figure)}{known}")
     if objective.take in ("time", "steps") and objective.target is None:
         raise ConfigError(f"{path}: objective.target: is missing; give the value of {figure} at which trials end")
     return Plan(name, given, cfg, figure, parameters, named)
@@ -293,7 +294,7 @@ def _try(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
 
 @contextmanager
 def _said_in(path: Path, section: str) -> Iterator[None]:
-    """Make errors in the block name the sweep's file instead of 'command line' or 'TASK'."""
+    """In errors that the block raises, replace 'command line' or 'TASK' by the sweep's file and section."""
     try:
         yield
     except ConfigError as error:

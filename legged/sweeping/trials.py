@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
 JOURNAL = "journal:"
-"""Prefix of a storage that is a journal file of Optuna."""
+"""Beginning of a storage's name if the storage is a journal file of Optuna."""
 BEAT_S = 10.0
 """Interval at which a process confirms that it works on its trial [s]."""
 GRACE_S = 120.0
@@ -37,7 +37,7 @@ GRACE_S = 120.0
 WAIT_S = 60
 """Longest wait for the lock of an SQLite file [s]."""
 FEWEST = 4
-"""Fewest trials with a value from which the importance of settings is computed."""
+"""The importance of settings is computed only if at least this many trials have a value."""
 MOST_TRIES = 5
 """Number of attempts after which a trial is given up."""
 OWNER, ALIVE, TRIES, WHY, RUNS = "owner", "alive", "tries", "why", "runs"
@@ -78,12 +78,12 @@ class Trials:
             raise RunError(f"sweep: the storage can't be used: {' '.join(str(error).split())[:300]}") from error
         if known not in (None, plan.identity):
             raise ConfigError(
-                f"sweep: '{plan.name}' was begun with another task, other seeds, overrides, parameters or another objective;"
-                " give this one another name (name: in its file)"
+                f"sweep: '{plan.name}' was begun with another task, other seeds, other overrides, other parameters or another"
+                " objective; give this sweep another `name` in its file"
             )
 
     def keep_to(self, device: str) -> None:
-        """At the first call, store the kind of device on which trials are trained, cpu or cuda. Later, compare with it.
+        """Store the `device` (cpu or cuda) on which trials are trained. If one is stored already, compare `device` with it.
 
         Raises:
             ConfigError: earlier trials were trained on the other kind.
@@ -93,8 +93,8 @@ class Trials:
             self.study.set_user_attr(DEVICE, device)
         elif known != device:
             raise ConfigError(
-                f"--sim-device: the trials of '{self.plan.name}' are trained on {known}, and those on {device} can't be"
-                f" compared with them; go on with --sim-device {known}, or give this sweep another name (name: in its file)"
+                f"--sim-device: earlier trials of '{self.plan.name}' were trained on {known} and can't be compared with"
+                f" trials on {device}; go on with --sim-device {known}, or give this sweep another `name` in its file"
             )
 
     @property
@@ -132,13 +132,13 @@ class Trials:
         return trial
 
     def end(self, trial: "Trial", state: str, why: str) -> None:
-        """End a trial that has no value. `state` is PRUNED if it was ended early, and FAIL if it does not count."""
+        """End a trial that has no value. `state` is PRUNED for an early end, and FAIL if the trial does not count."""
         trial.set_user_attr(WHY, why)
         self.study.tell(trial, state=self._optuna.trial.TrialState[state])
 
     def take_back(self) -> list[int]:
-        """Queue the trials of dead processes again, and return the trials' numbers. If several processes call this, only one
-        queues a trial.
+        """Queue the trials of dead processes again, and return the trials' numbers. If several processes call this at the
+        same time, each trial is queued only once.
         """
         taken = []
         for trial in self._running():
@@ -149,8 +149,8 @@ class Trials:
         return taken
 
     def try_again(self, trial: "Trial | FrozenTrial", why: str) -> bool:
-        """End a trial without a value, and queue its settings again unless they had too many attempts. Return False if
-        another process has ended the trial.
+        """End a trial that has no value. Queue its settings again unless they had too many attempts. Return False if another
+        process has already ended the trial.
         """
         tries = int(trial.user_attrs.get(TRIES, 1))
         last = tries >= MOST_TRIES
@@ -187,7 +187,8 @@ def _open(asked: str, folder: Path) -> "BaseStorage":
         make_folder(folder)
         asked = f"sqlite:///{(folder / 'sweep.db').absolute()}"
     scheme, mark, rest = asked.partition("://")
-    where = f"storage: '{scheme}{mark}***@{rest.rpartition('@')[2]}'" if "@" in rest else f"storage: '{asked}'"  # no password
+    # Messages must not show the password of a database.
+    where = f"storage: '{scheme}{mark}***@{rest.rpartition('@')[2]}'" if "@" in rest else f"storage: '{asked}'"
     try:
         if asked.startswith(JOURNAL):
             file = Path(asked.removeprefix(JOURNAL))
@@ -243,7 +244,7 @@ def _machine() -> str:
 
 
 def _began(pid: int) -> str:
-    """Return the start time of a process on this machine, in the system's unit; 'gone' if there is no such process."""
+    """Return the start time of a process on this machine, 'there' if the time is unknown, or 'gone' if the process ended."""
     with suppress(OSError):
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return "gone" if fields[0] in "ZX" else fields[19]
@@ -257,8 +258,8 @@ def _began(pid: int) -> str:
 
 @contextmanager
 def repeating(call: Callable[[], None], every_s: float, at_end: bool = False) -> Iterator[None]:
-    """Call a function every `every_s` seconds in a thread while the block runs, and once more after it if `at_end`. The block
-    ends when the last call has returned.
+    """Call a function every `every_s` seconds in a thread while the block runs. `at_end` adds a call after the block. The
+    context ends when the last call has returned.
     """
     over = threading.Event()
 
@@ -335,7 +336,7 @@ def table(plan: Plan, trials: Sequence["FrozenTrial"], module: str | None = None
     if ranked:
         words = ["legged", "train", *(["--import", module] if module else []), plan.task]
         words += [_override(path, value) for path, value in plan.settings(ranked[0].params).items()]
-        parts += ["The settings of the best, as YAML:", f"```yaml\n{best_yaml(plan, ranked[0])}```"]
+        parts += ["The settings of the best trial, as YAML:", f"```yaml\n{best_yaml(plan, ranked[0])}```"]
         parts += ["and on the command line:", f"```\n{shlex.join(words)}\n```"]
         if plan.given.overrides:
             common = ", ".join(f"`{path}={_text(value)}`" for path, value in plan.given.overrides.items())
@@ -359,7 +360,7 @@ def _text(value: Any) -> str:
 
 
 def _override(path: str, value: Any) -> str:
-    """Return `key=value` for the command line, with quotation marks around a text that would be read as something else."""
+    """Return `key=value` for the command line. A text that would be read as another type gets quotation marks."""
     plain = f"{path}={_text(value)}"
     return plain if parse_override(plain) == (path, value) else f"{path}={json.dumps(value)}"
 
@@ -374,10 +375,10 @@ def best_yaml(plan: Plan, best: "FrozenTrial") -> str:
 
 
 def draw_figures(trials: Trials) -> list[Path]:
-    """Draw Optuna's figures of the trials: values over trials, values over settings, and the importance of settings for a
-    trial to be among the best (PED-ANOVA, Watanabe et al., arXiv 2304.10255). Importance is left out while there are too few
-    trials, and while the best quarter is no better than the rest, because all settings would then be equally important.
-    Return the paths of the files.
+    """Draw Optuna's figures of the trials, and return the files' paths. The figures show values over trials, values over
+    settings, and the importance of each setting, i.e. how much it decides whether a trial is among the best (PED-ANOVA,
+    Watanabe et al., arXiv 2304.10255). Importance is left out if there are too few trials. It is also left out if the best
+    quarter is no better than the rest, because all settings would then be equally important.
 
     Raises:
         RunError: a file can't be written.

@@ -1,10 +1,10 @@
 """Tiles of terrain. A small NumPy function makes each type. Names and sizes mostly follow legged_gym (arXiv 2109.11978).
 
-Every generator takes a `Tile` of zeros and a size that depends on the difficulty, in metres or degrees, and fills in the
-heights of the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
+Every generator takes a `Tile` of zeros and a size (in metres or degrees) that depends on the difficulty. The generator fills
+in the heights of the cells [m]. Robots start in the middle and walk outward, so `stairs_up` has its platform at the bottom.
 
-All other lengths here (treads, platforms, bumps, blocks) suit a robot that stands half a metre high. They are multiplied by
-the tile's `scale`.
+Lengths that do not depend on the difficulty (treads, platforms, bumps, blocks) are for a robot that stands half a metre
+high. They are multiplied by the tile's `scale`.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ GRID = 0.45
 STONE_SIDES = (0.2, 0.5)
 """Shortest and longest side of a stone of rubble [m]."""
 NARROWEST_DITCH = 0.5
-"""Largest edge of a cell for the type `gap`, whose ditch gets up to 1 m wide [m]."""
+"""Largest edge of a cell on tiles of the type `gap` [m]. The ditch on these tiles is up to 1 m wide."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Tile:
     rng: np.random.Generator
     """Source of all randomness of the tile."""
     scale: float = 1.0
-    """Factor on the lengths of the type."""
+    """Factor by which the lengths of the terrain type are multiplied."""
     tread: float | None = None
     """Width of a step of stairs [m]; None for the type's own width. The scale does not multiply this width."""
 
@@ -85,14 +85,14 @@ def slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
 
 
 def rough_slope(tile: Tile, degrees_up: float, platform: float = 3.0) -> None:
-    """Make a pyramid with bumps: heights in multiples of 5 mm at points 0.2 m apart, linear in between."""
+    """Make a pyramid with the `bumps` of rough ground."""
     slope(tile, degrees_up, platform)
     tile.heights[:] += bumps(tile, BUMPS)
 
 
 def bumps(tile: Tile, amplitude: float, step: float = 0.005, spacing: float = 0.2) -> np.ndarray:
-    """Return (length, width) heights of rough ground: U(-amplitude, amplitude) at the points of a coarse lattice, linear in
-    between.
+    """Return the heights (length, width) of rough ground [m]. Points that are `spacing` apart have random heights from
+    -amplitude to amplitude in steps of `step`. Heights between these points are interpolated linearly.
     """
     levels = tile.scale * np.arange(-amplitude, amplitude + 0.5 * step, step)
     every = max(1, tile.cells(spacing))
@@ -124,8 +124,8 @@ def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE)
 
 
 def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20) -> None:
-    """Make rectangular blocks and pits, anywhere but in the middle. Their sides are 1 to 2 m long. Heights and depths are
-    `height` or half of it.
+    """Make rectangular blocks and pits, anywhere but in the middle. Their sides are 1, 1.4 or 1.8 m long. Heights and depths
+    are `height` or half of it.
     """
     rows, columns = tile.heights.shape
     sides = [max(1, tile.cells(0.1 * tenths)) for tenths in range(10, 20, 4)]
@@ -138,7 +138,7 @@ def obstacles(tile: Tile, height: float, platform: float = 3.0, count: int = 20)
 
 
 def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float = JOINT) -> None:
-    """Make square stones of side `stone` in rows shifted against each other, with gaps around them."""
+    """Make square stones of side `stone` with gaps around them. Rows of stones are shifted against each other at random."""
     side, between = max(1, tile.cells(stone / tile.scale)), max(1, tile.cells(gap))
     rows, columns = tile.heights.shape
     tile.heights[:] = -HOLE_DEPTH * tile.scale
@@ -173,8 +173,8 @@ def dense_blocks(tile: Tile, height: float, platform: float = 2.0, cover: float 
     """Stack overlapping blocks on the whole tile except its middle.
 
     Sides are drawn from BLOCK_SIDES. Tops are at 0, 1, 2, 3 or 4 quarters of `height`. Where blocks overlap, the later one
-    counts. The sum of the blocks' areas is `cover` times the area of the tile. At the default, a robot meets a face of up to
-    `height` every few steps, and hardly ever a level stretch as long as itself.
+    counts. The sum of the blocks' areas is `cover` times the area of the tile. At the default `cover`, a robot meets a
+    face of up to `height` every few steps, and hardly ever a level stretch as long as itself.
     """
     rows, columns = tile.heights.shape
     left = cover * rows * columns
@@ -240,7 +240,7 @@ class TerrainType:
     generate: Callable[[Tile, float], None]
     """Generator, called with a tile and a size in `unit`."""
     size: Callable[[float], float]
-    """Difficulty -> size at scale 1, in `unit`. Training begins at difficulty 0; difficulty 1 is one row past the hardest."""
+    """Difficulty -> size at scale 1, in `unit`. Training begins at difficulty 0. The hardest of N rows has 1 - 1/N."""
     unit: str
     what: str
     """Name of the size, such as "step height"."""
@@ -254,7 +254,7 @@ class TerrainType:
     """Length [m] and name of the smallest part of a tile of scale 1; cells must not be larger than this part."""
     exact: bool = False
     """True if the length of the smallest part must be a whole number of cells, because rounding it would change the ground.
-    Evaluations choose their cells accordingly."""
+    Evaluations use cells that divide this length."""
 
     def sized(self, difficulty: float, scale: float) -> float:
         """Return the size at a difficulty, in `unit`. The size is multiplied by `scale`, the scale of the tiles, unless it is
@@ -278,7 +278,7 @@ LARGEST, STEEPEST = 100.0, 80.0
 
 
 def _angle(difficulty: float) -> float:
-    """Return the angle of a slope whose rise over run is 0.4 * difficulty [degrees]."""
+    """Return the angle [degrees] of a slope whose rise over run is 0.4 * difficulty."""
     return degrees(atan(0.4 * difficulty))
 
 

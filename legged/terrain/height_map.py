@@ -1,4 +1,4 @@
-"""One height map for all worlds: square cells with separate corners, so that faces between cells can be vertical."""
+"""One height map for all worlds. Its square cells share no corners, so that faces between cells can be vertical."""
 
 from dataclasses import dataclass
 
@@ -65,7 +65,8 @@ class HeightMap:
 
     def scan_map(self, scan: str) -> np.ndarray:
         """Return (X, Y) float32: the height that a height scan measures in each cell [m]. `scan` is the setting terrain.scan.
-        "lowest" takes the lowest of the cell and its next neighbours along +x and +y, as legged_gym does at a vertical face.
+        "own" takes the height of the cell. "lowest" (as in legged_gym) or "highest" takes the lowest or highest height of the
+        cell and its next neighbours along +x and +y.
         """
         if scan == "own":
             return self.heights.astype(np.float32)

@@ -13,15 +13,15 @@ from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
 
 SPAWN_SQUARE = 2.0
-"""Side at scale 1 of the square in the middle of a tile [m]. Robots start at the height of the square's highest point."""
+"""Side of the square in the middle of a tile, if `scale` is 1 [m]. Robots start at the height of its highest point."""
 EDGE = 1.0
-"""A robot counts as having left the map if it is nearer than this to the map's end [m]."""
+"""Width of a strip along the inside of the map's edge [m]. A robot in this strip counts as having left the map."""
 WITHOUT_CURRICULUM = (0.5, 0.75, 0.9)
 """Difficulties of a terrain without a curriculum. Each row gets one of them at random."""
 MOST_TILES = 10_000
-"""Largest number of tiles; each is generated separately."""
+"""Largest number of tiles in a terrain. The tiles are generated one after the other, which takes time."""
 MOST_CELLS = 2**24
-"""Largest number of cells; the height scan numbers them in float32, which is exact up to this number."""
+"""Largest number of cells. The height scan computes cell numbers in float32, which is exact up to this number."""
 
 
 @dataclass(frozen=True)
@@ -30,20 +30,20 @@ class TileSpec:
 
     type: str
     size: float
-    """Size in the unit of the type [m or degrees]."""
+    """Size of the type's features, such as the height of a step or the angle of a slope [m or degrees]."""
     tread: float | None = None
-    """Width of a step of stairs [m]; None for the type's own."""
+    """Width of a step of stairs [m]. None: the default width of the type."""
 
 
 @dataclass(frozen=True)
 class Terrain:
-    """R x C tiles with a level border, centred on the world's origin; rows along x, columns along y."""
+    """R x C tiles with a level border, centred on the world's origin. x increases with the row, y with the column."""
 
     height_map: HeightMap
     types: tuple[str, ...]
     """(C,) type of each column."""
     origins: np.ndarray
-    """(R, C, 3) middle of each tile at the height at which robots stand there, world frame [m]."""
+    """(R, C, 3) middle of each tile, world frame [m]. z is the height of the ground on which robots start."""
     tile_size: tuple[float, float]
     """Extent of a tile along x and y [m]."""
     border: float
@@ -51,7 +51,7 @@ class Terrain:
 
     @classmethod
     def build(cls, cfg: TerrainConfig, seed: int) -> "Terrain":
-        """Return the terrain for training. Types have columns by their shares. In a curriculum, later rows are harder."""
+        """Return the terrain for training. Each type gets its share of columns. In a curriculum, later rows are harder."""
         columns = column_types(cfg.proportions, cfg.num_cols)
         rng = np.random.default_rng(seed)
         rows = []
@@ -62,7 +62,7 @@ class Terrain:
 
     @classmethod
     def of_tiles(cls, rows: Sequence[Sequence[TileSpec]], cfg: TerrainConfig, rng: np.random.Generator) -> "Terrain":
-        """Return a terrain of the given tiles. It uses only the lengths, the scale and the slope threshold of `cfg`."""
+        """Return a terrain of the given tiles. Of `cfg`, only the lengths, `scale` and `slope_threshold` are used."""
         cell = cfg.horizontal_scale
         length, width, border = (round(x / cell) for x in (cfg.terrain_length, cfg.terrain_width, cfg.border_size))
         count = (len(rows), len(rows[0]))
@@ -106,7 +106,7 @@ class Terrain:
 
 
 def tile_size(cfg: TerrainConfig, name: str, difficulty: float) -> float:
-    """Return the size of a tile of type `name` at a difficulty, in the type's unit [m or degrees]."""
+    """Return the size of the features of type `name` (such as a step height) at a difficulty [m or degrees]."""
     asked, kind = cfg.sizes.get(name), TERRAIN_TYPES[name]
     if asked is None:
         return kind.sized(difficulty, cfg.scale)
@@ -123,7 +123,9 @@ def hardest_difficulty(cfg: TerrainConfig) -> float:
 
 
 def column_types(proportions: dict[str, float], num_cols: int) -> list[str]:
-    """Return the type of each column: the type at its middle, if the types lie side by side, as wide as their shares."""
+    """Return the type of each column. Each type takes its share of the interval from 0 to 1, in the order of `proportions`. A
+    column has the type in which its middle lies.
+    """
     names = [name for name, share in proportions.items() if share > 0.0]
     ends = np.cumsum([proportions[name] for name in names])
     middles = (np.arange(num_cols) + 0.5) / num_cols
@@ -134,8 +136,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     """Check all values of a terrain's configuration.
 
     Raises:
-        ConfigError: a value is wrong. The text names the field, the value that it contradicts, and where both were set (from
-            `origins`).
+        ConfigError: a value is wrong. The message names the field, any other field that contradicts it, and the
+            sources of both (from `origins`).
     """
     if cfg.mesh_type == "plane":
         return
@@ -164,8 +166,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:
             raise ConfigError(
-                f"{where(f'proportions.{name}')}: a share of {share:g} of {among('num_cols')} columns is less than one"
-                " column; ask for more columns or leave the type out"
+                f"{where(f'proportions.{name}')}: a share of {share:g} is less than one column, because"
+                f" {among('num_cols')}; ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
         finest = kind.finest[0] * cfg.scale if kind.finest else float("inf")
@@ -189,8 +191,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     side = min(cfg.terrain_length, cfg.terrain_width)
     if cfg.spawn_range >= 0.5 * side:
         raise ConfigError(
-            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of their tile, and so"
-            f" outside this tile of {side:g} m ({among('terrain_length')}, {among('terrain_width')})"
+            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of their tile. That is"
+            f" outside the tile, whose shorter side is {side:g} m ({among('terrain_length')}, {among('terrain_width')})"
         )
     if cfg.border_size < 2.0 * EDGE:
         raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
@@ -201,7 +203,7 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     if cfg.num_rows * cfg.num_cols > MOST_TILES:
         raise ConfigError(
             f"{where('num_rows')}: {among('num_rows')} times {among('num_cols')} are {cfg.num_rows * cfg.num_cols:,} tiles,"
-            f" more than {MOST_TILES:,}"
+            f" but at most {MOST_TILES:,} are allowed"
         )
     tiles = (cfg.num_rows * cfg.terrain_length, cfg.num_cols * cfg.terrain_width)
     x, y = (size + 2.0 * cfg.border_size for size in tiles)
@@ -209,5 +211,5 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     if cells > MOST_CELLS:
         raise ConfigError(
             f"{where('horizontal_scale')}: {x:g} x {y:g} m in cells of {cfg.horizontal_scale:g} m are"
-            f" {cells:,.0f} cells, more than {MOST_CELLS:,}; ask for larger cells or fewer tiles"
+            f" {cells:,.0f} cells, but at most {MOST_CELLS:,} are allowed; ask for larger cells or fewer tiles"
         )

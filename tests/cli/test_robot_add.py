@@ -94,7 +94,7 @@ def test_what_a_file_does_not_say_is_guessed_and_named(added):
     out = added(urdf().replace('effort="30"', 'effort="0"'), "--name", "third_toy")
     robot = load_robot("mine/third_toy")
     np.testing.assert_allclose(robot.torque_limits, 0.4 * 13.0 * 9.81 * robot.height, atol=0.06)
-    assert "guess: torque limits that the file lacks are 0.4 m g h: fl_hip" in out
+    assert "guess: torque limits missing in the file are set to 0.4 m g h: fl_hip" in out
     text = Path("mine/third_toy/robot.yaml").read_text()
     for line in (line.strip() for line in out.splitlines() if line.startswith("  guess: t")):
         assert f"# {line}" in text
@@ -286,7 +286,7 @@ def test_a_source_in_the_robots_own_folder_is_left_alone(tmp_path, capsys, force
     (tmp_path / "go/meshes/cube.obj").write_text(cube)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
     assert call(add.main, ["go/go.xml", "--out", ".", *force]) == 2
-    assert "go/go.xml: the new robot would overwrite its folder go; give another --name or --out" in capsys.readouterr().err
+    assert "go/go.xml: is in go, which the new robot would overwrite; give another --name or --out" in capsys.readouterr().err
     assert call(add.main, ["go.urdf", "--out", ".", *force]) == 2
     message = "go/meshes/cube.obj: is in go, which" if force else "go exists already"
     assert message in capsys.readouterr().err

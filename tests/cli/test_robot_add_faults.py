@@ -58,7 +58,7 @@ def degrees(text: str) -> str:
         (urdf().replace('<mass value="6"/>', '<mass value="${m}"/>'), "xacro toy.urdf > toy.plain.urdf"),
         (
             urdf(extra='<xacro:property xmlns:xacro="http://www.ros.org/wiki/xacro" name="m" value="1"/>'),
-            "is a xacro file; write the URDF first: xacro toy.urdf > toy.plain.urdf",
+            "is a xacro file; write the URDF first with `xacro toy.urdf > toy.plain.urdf`",
         ),
         (urdf().replace("<axis", '<mimic joint="fl_knee"/><axis', 1), "mimic: there is no joint 'fl_knee'"),
         (
@@ -147,7 +147,7 @@ def test_counts_are_of_after_the_feet_were_fitted(added, tmp_path):
 def test_gains_are_raised_until_the_robot_stands(added):
     """The rule's gains let this one sink to three quarters: its light shanks limit them."""
     out = added(XML.format(head="", legs=LEGS), "--name", "sinker", file="toy.xml")
-    assert "times the rule's. With the rule's in C MuJoCo the base sinks from " in out
+    assert "times the rule's. With the rule's gains, in C MuJoCo the base sinks from " in out
     robot = load_robot("mine/sinker")
     assert height_under_gains(robot, robot.stiffness, robot.damping) > 0.84 * robot.height
     out = added(XML.format(head="", legs=LEGS), "--name", "soft", "--stiffness", "5", "--damping", "0.3", file="toy.xml")

@@ -118,7 +118,7 @@ def test_all_feet_stand_on_the_same_ground(added, legs):
     else:
         count = int(legs[-1])
         out = added(SPIDER.format(count=count, turn=360 / count), "--name", name, file="toy.xml")
-    assert "look at it" not in out
+    assert "look at the default pose" not in out
     robot = load_robot(f"mine/{name}")
     model = mujoco.MjModel.from_xml_path(str(robot.model_path))
     data = mujoco.MjData(model)

@@ -143,7 +143,7 @@ def test_all_that_stands_of_a_sole_is_the_foot(added, sole):
     assert [len(shapes) for shapes in robot.feet_shapes] == [len(SOLES[sole])] * 2
     assert not any("last" in robot.contact_names[i] for i in robot.penalised_indices)
     assert any("shank" in robot.contact_names[i] for i in robot.penalised_indices)
-    assert "look at it" not in out
+    assert "look at the default pose" not in out
     data = mujoco.MjData(model := mujoco.MjModel.from_xml_path(str(robot.model_path)))
     data.qpos[3:] = [1.0, 0.0, 0.0, 0.0, *robot.default_dof_pos]
     mujoco.mj_kinematics(model, data)

@@ -335,7 +335,7 @@ def test_a_run_of_somebodys_own_task_says_how_it_is_found_again(forgotten, capsy
     assert report.main([str(folder)]) == 0
     text = read(folder, "report.md")
     command = f"legged runs report --import 'my own.d/mine.yaml' {folder}"
-    assert f"There is no task 'mine' here to compare with, and `{command}`" in text
+    assert f"There is no task 'mine' here to compare with. Where it exists, `{command}`" in text
     assert "| `rewards.scales.torques` | `-0.0003` |" in text
     assert table.main(["--out", "all"]) == 0
     assert "sim.physics mujoco, sim.threads 1, runner.num_steps_per_env 4" in read(Path("all"), "experiments.md").replace(
@@ -367,11 +367,11 @@ def test_a_task_without_commands_is_told_the_command_that_films_it(forgotten, ca
     assert report.main([*told, "mine", "--film"]) == 0
     out = capsys.readouterr().out
     assert "no film: 'mine' has no velocity commands" in out
-    assert f"{shlex.join([*film, '--gif'])} makes one\n" in out
+    assert f"film it with `{shlex.join([*film, '--gif'])}`\n" in out
 
     plain = tiny_run("--task", "half_cheetah", iterations=1)
     assert report.main([str(plain), "--film"]) == 0
-    assert f"legged play {plain} --gif makes one\n" in capsys.readouterr().out
+    assert f"film it with `legged play {plain} --gif`\n" in capsys.readouterr().out
 
 
 # ---- command line ----------------------------------------------------------------------------------------------------

@@ -111,7 +111,7 @@ def states(trials: Trials) -> list[str]:
         ),
         ({"parameters": {"env.seed": {"low": 1, "high": 3}}}, "parameters: env.seed: leave it out; the sweep sets it"),
         ({"overrides": {"env.num_env": 3}}, "mine.yaml: overrides: env.num_env: unknown key 'num_env'"),
-        ({"objective": {"figure": "reward"}}, "objective.figure: evaluations of 'half_cheetah' find no 'reward'"),
+        ({"objective": {"figure": "reward"}}, "objective.figure: evaluations of 'half_cheetah' do not measure 'reward'"),
         ({"objective": {"take": "time"}}, "objective.target: is missing; give the value of return"),
         ({"storage": "somewhere"}, "storage: 'somewhere' is no storage; expected sqlite:///<file>"),
     ],
@@ -132,9 +132,7 @@ def test_a_sweep_that_is_not_there_and_a_package_that_is_not_installed(monkeypat
     found = util.find_spec
     monkeypatch.setattr(planning, "find_spec", lambda name: None if name == "optuna" else found(name))
     assert call(sweep.main, FLAGS) == 2
-    assert capsys.readouterr().err == (
-        "error: sweep: needs the package optuna, which is not installed here: pip install optuna\n"
-    )
+    assert capsys.readouterr().err == "error: sweep: the package optuna is not installed; run `pip install optuna`\n"
 
 
 def test_values_are_of_the_setting_s_kind_and_within_the_range():

@@ -91,7 +91,7 @@ def test_a_sweep_that_was_begun_on_a_cpu_does_not_go_on_with_a_gpu_but_is_report
     trials.keep_to("cpu")
     monkeypatch.setattr("legged.cli.sweep.pick_device", lambda name: torch.device("cuda"))
     assert call(sweep.main, ["mine.yaml"]) == 2
-    said = "error: --sim-device: the trials of 'sweep_mine' are trained on cpu, and those on cuda can't be compared with them"
+    said = "error: --sim-device: earlier trials of 'sweep_mine' were trained on cpu and can't be compared with trials on cuda"
     assert capsys.readouterr().err.startswith(said)
     assert call(reporting.main, ["mine.yaml"]) == 0
 

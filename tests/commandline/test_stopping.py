@@ -34,7 +34,9 @@ def test_the_first_signal_asks_and_the_second_one_interrupts(number, capsys):
     with pytest.raises(KeyboardInterrupt):
         stop_twice()
     assert asked == [number]
-    assert capsys.readouterr().err == "stopping after this iteration, with a checkpoint; a second signal stops it at once\n"
+    assert (
+        capsys.readouterr().err == "stopping after this iteration, with a checkpoint; a second signal ends the training now\n"
+    )
     assert signal.getsignal(number) == before
 
 

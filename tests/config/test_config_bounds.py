@@ -205,13 +205,13 @@ def test_weights_are_counted(network):
     """Four times 16384^2 are 2^30, as many as there may be."""
     path = f"train.policy.{network}_hidden_dims"
     assert small_config((path, [16384] * 5))
-    with pytest.raises(ConfigError, match=rf"command line: {path}: these are 1,342,177,280 weights"):
+    with pytest.raises(ConfigError, match=rf"command line: {path}: these widths make 1,342,177,280 weights"):
         small_config((path, [16384] * 6))
 
 
 def test_measuring_points_are_counted():
     grid = [("terrain.measured_points_x", [0.1] * 101), ("terrain.measured_points_y", [0.0] * 100)]
-    with pytest.raises(ConfigError, match=r"measured_points_x: makes 10,100 points"):
+    with pytest.raises(ConfigError, match=r"measured_points_x: the height scan has 10,100 points"):
         small_config(*grid)
 
 
@@ -263,7 +263,7 @@ def test_keys_are_text(tmp_path):
     path = tmp_path / "mine.yaml"
     for text, words in (
         ("1: 2", "1: unknown key 1"),
-        ("rewards: {scales: {1: 2}}", "rewards.scales: expected text for a key"),
+        ("rewards: {scales: {1: 2}}", "rewards.scales: expected a mapping whose keys are text"),
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=words):

@@ -122,13 +122,14 @@ def test_what_a_value_does_not_fit_is_named_too(mine):
     message = error_of(("terrain.num_rows", 10), ("terrain.terrain_width", 2.5))
     assert message.startswith("command line: terrain.terrain_width: a tile of 8 x 2.5 m")
     assert message.endswith(f"(proportions.slope_up: {ROUGH})")
-    assert "of num_cols = 1 (command line) columns" in error_of(("terrain.num_rows", 10), ("terrain.num_cols", 1))
+    message = error_of(("terrain.num_rows", 10), ("terrain.num_cols", 1))
+    assert "is less than one column, because num_cols = 1 (command line)" in message
 
 
 def test_a_symmetry_that_the_points_break_is_asked_for_by_one_and_broken_by_another(mine):
     path = mine("terrain: {measured_points_y: [0.0, 0.1]}")
     message = error_of(("train.algorithm.symmetry", True))
-    assert message.startswith(f"command line: train.algorithm.symmetry: terrain.measured_points_y ({path}) are not the same")
+    assert message.startswith(f"command line: train.algorithm.symmetry: terrain.measured_points_y ({path}) must be symmetric")
 
 
 def test_a_cpu_section_is_blamed_on_the_file_that_it_stands_in(mine):

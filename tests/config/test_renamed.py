@@ -48,7 +48,7 @@ def test_a_setting_by_both_names_is_refused(old):
     for part in way:
         inner = inner.setdefault(part, {})
     inner[last] = 2
-    with pytest.raises(ConfigError, match=rf"mine: {old}: 1: renamed {RENAMED[old]}, which is set too"):
+    with pytest.raises(ConfigError, match=rf"mine: {old}: 1: renamed to {RENAMED[old]}, which is set too"):
         renamed(data, "mine")
 
 

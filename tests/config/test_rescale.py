@@ -144,11 +144,11 @@ def test_a_user_defined_reward_is_rescaled_by_its_mark():
 @pytest.mark.parametrize(
     ("kind", "config", "message"),
     [
-        (Bare, {**FOR_GO2, **SLIP}, r'rewards\.scales\.slip: .* Bare\._reward_slip declares no unit .*@unit\("m\^2/s\^2"\)'),
+        (Bare, {**FOR_GO2, **SLIP}, r'rewards\.scales\.slip: .* Bare\._reward_slip declares no unit\..*@unit\("m\^2/s\^2"\)'),
         (
             Overridden,
             {"extends": "go2_flat"},
-            r'rewards\.scales\.torques: .* Overridden\._reward_torques declares no unit .*@unit\("N\^2 m\^2"\)',
+            r'rewards\.scales\.torques: .* Overridden\._reward_torques declares no unit\..*@unit\("N\^2 m\^2"\)',
         ),
     ],
 )

@@ -79,9 +79,9 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
     [
         (
             {"contract_version": None},
-            r"contract_version: got none, because an older version .* export the policy again \(legged play",
+            r"contract_version: got none \(an older version .* export the policy again with `legged play",
         ),
-        ({"contract_version": 2}, r"contract_version: got 2; this program reads 1"),
+        ({"contract_version": 2}, r"contract_version: got 2, but this program reads 1;"),
         ({"control_type": "T"}, r"control_type: got 'T'; a robot takes joint angles"),
         ({"control_type": None}, r"control_type: got None; a robot takes joint angles"),
         ({"command_ranges": None}, r"'anymal_c_flat' is no task of a legged robot"),
@@ -192,7 +192,7 @@ def test_files_of_two_exports_are_refused(folder, tmp_path):
     for key, value in (("action_scale", 0.25), ("stiffness", [90.5] * 12), ("damping", [3.0] * 12), ("control_dt", 0.01)):
         changed(folder, tmp_path, **{key: value})
         with pytest.raises(
-            ConfigError, match=rf"{key}: differs from that of .*policy\.onnx; the files are from different exports"
+            ConfigError, match=rf"{key}: .*policy\.onnx has another value; the files are from different exports"
         ):
             Policy(tmp_path)
 
@@ -241,7 +241,7 @@ def export_of(folder, tmp_path):
 def test_every_entry_is_compared_with_the_onnx_file(export_of, changes):
     (key,) = changes
     with pytest.raises(
-        ConfigError, match=rf"policy\.json: {key}: differs from that of .*policy\.onnx; the files are from different exports"
+        ConfigError, match=rf"policy\.json: {key}: .*policy\.onnx has another value; the files are from different exports"
     ):
         Policy(export_of(sha256=None, **changes))
 
@@ -260,7 +260,7 @@ def test_a_file_that_was_changed_after_the_export_is_refused(name, folder, tmp_p
     changed(folder, tmp_path)
     for file in ("policy.onnx", "policy.weights"):
         (tmp_path / file).write_bytes((folder / file).read_bytes() + (b"\0" if file == name else b""))
-    with pytest.raises(ConfigError, match=rf"{name}: is not the file that was exported with .*policy\.json \(sha256\)"):
+    with pytest.raises(ConfigError, match=rf"{name}: is not the file exported with .*policy\.json \(sha256\)"):
         read_contract(tmp_path / "policy.json")
 
 
@@ -279,9 +279,9 @@ def test_a_network_of_weights_that_are_not_finite_is_refused(export_of):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('{"observation": ' + "[" * 500 + "]" * 500 + "}", "is nested too deeply"),
-        ('{"observation": [], "sim_dt": ' + "1" * 400 + "}", "has a whole number of 400 digits"),
-        ('{"observation": [], "sim_dt": ' + "1" * 5000 + "}", "has a whole number of 5000 digits"),
+        ('{"observation": ' + "[" * 500 + "]" * 500 + "}", "the JSON text is nested too deeply"),
+        ('{"observation": [], "sim_dt": ' + "1" * 400 + "}", "a whole number has 400 digits, more than 18"),
+        ('{"observation": [], "sim_dt": ' + "1" * 5000 + "}", "a whole number has 5000 digits, more than 18"),
     ],
     ids=["deep", "long", "longer"],
 )

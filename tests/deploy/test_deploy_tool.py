@@ -122,7 +122,7 @@ def test_a_robot_of_ones_own_is_simulated_without_naming_it(own_run, monkeypatch
         return capsys.readouterr().err
 
     assert "POLICY: logs/toy_flat/" in (said := error(own_run))
-    assert "was trained on a user-defined task, 'toy_flat'; name the file that defines it with --import FILE" in said
+    assert "was trained on a user-defined task, 'toy_flat'; to name the file that defines it, use --import FILE" in said
     robot = Path("mine/toy").resolve()
     assert call(deploy.sim.main, ["mine/toy_flat.yaml"]) == 0
     assert call(deploy.sim.main, [str(own_run / "exported")]) == 0

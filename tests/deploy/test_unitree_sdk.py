@@ -70,7 +70,7 @@ class Sdk:
 
 def test_without_the_sdk_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "unitree_sdk2py", None)
-    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(.*\): pip install 'legged\[unitree-sdk2\]'"):
+    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(.*\); run `pip install 'legged\[unitree-sdk2\]'`"):
         SdkWire(KINDS["go2"], "lo", 1)
 
 
@@ -130,7 +130,7 @@ def test_an_sdk_that_cannot_switch_controllers_is_refused_at_once(monkeypatch):
         return found(name)
 
     monkeypatch.setattr(unitree, "import_module", without)
-    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(No module named .*motion_switcher.*\): pip install"):
+    with pytest.raises(ConfigError, match=r"SDK cannot be imported \(No module named .*motion_switcher.*\); run `pip"):
         SdkWire(KINDS["g1"], "eth0", 0)
     SdkWire(KINDS["g1"], "lo", 1).take_over()
 

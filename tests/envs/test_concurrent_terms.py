@@ -83,7 +83,7 @@ READERS = {
 def test_a_marked_term_that_reads_what_is_not_settled_is_refused(reader):
     terms = terms_on(1, reset_buf=ENDED)
     terms.add("_metric_", {"ends": concurrent(READERS[reader])})
-    with pytest.raises(TermError, match=r"^_metric_ends: reads self\.reset_buf, .* @concurrent: remove that mark"):
+    with pytest.raises(TermError, match=r"^_metric_ends: reads self\.reset_buf, .* remove @concurrent from this term"):
         terms.start()
 
 

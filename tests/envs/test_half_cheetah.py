@@ -93,5 +93,5 @@ def test_parts_of_the_reward_and_the_velocity_are_logged():
 
 def test_symmetry_is_refused():
     cfg = override(task_config("half_cheetah", on_cpu=True), [("train.algorithm.symmetry", True)])
-    with pytest.raises(ValueError, match=r"train\.algorithm\.symmetry: HalfCheetah has no left and right"):
+    with pytest.raises(ValueError, match=r"train\.algorithm\.symmetry: HalfCheetah has no mirror images"):
         make_task(cfg)

@@ -303,6 +303,6 @@ def test_a_constructor_that_passes_on_what_it_gets_is_allowed():
 @pytest.mark.parametrize("name", ["step", "get_observations"])
 def test_what_training_does_not_call_is_refused(name):
     mine = type("Mine", (LeggedRobot,), {name: lambda self, *args: None})
-    with pytest.raises(ConfigError, match=rf"Mine\.{name} would not act: training "):
+    with pytest.raises(ConfigError, match=rf"Mine\.{name} would have no effect: training "):
         mine.check(small_config())
     type("Mine", (LeggedRobot,), {name: lambda self, *args: None, "OWN_HELPERS": (name,)}).check(small_config())

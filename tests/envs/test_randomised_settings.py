@@ -155,11 +155,11 @@ def test_mistakes_are_named(name, draw, error):
         ([observing("push_force")], r"groups\.critic\.terms: push_force: domain_rand\.forces names no force"),
         (
             [with_ranges(base_com_y=[0.0, 0.1]), observing("rand_base_com_y")],
-            r"groups\.critic\.terms: rand_base_com_y: its range \[0, 0\.1\] is not the same on both sides of 0, so",
+            r"groups\.critic\.terms: rand_base_com_y: its range \[0, 0\.1\] is not symmetric about 0, so",
         ),
         (
             [with_ranges(joint_offset={"range": [-0.02, 0.04], "when": "reset"}), observing("rand_joint_offset")],
-            r"groups\.critic\.terms: rand_joint_offset: its range \[-0\.02, 0\.04\] is not the same on both sides",
+            r"groups\.critic\.terms: rand_joint_offset: its range \[-0\.02, 0\.04\] is not symmetric about 0",
         ),
     ],
 )
@@ -183,10 +183,10 @@ def test_what_leans_to_a_side_may_be_observed_without_mirror_images_and_drawn_wi
             "anymal_c_flat",
             "link_mass",
             True,
-            "numbers for each of the moving bodies have no mirror image; set each: false",
+            "numbers for each of the moving bodies have no mirror image; set each to false",
         ),
-        ("anymal_c_flat", "friction", True, "numbers for each of the shapes have no mirror image; set each: false"),
-        ("anymal_c_flat", "joint_offset", False, "one number for all joints has no mirror image; set each: true"),
+        ("anymal_c_flat", "friction", True, "numbers for each of the shapes have no mirror image; set each to false"),
+        ("anymal_c_flat", "joint_offset", False, "one number for all joints has no mirror image; set each to true"),
         ("anymal_c_flat", "joint_damping", True, ""),
         (
             "cassie_flat",

@@ -179,7 +179,7 @@ def test_a_mistake_in_an_extended_registered_task_is_blamed_on_it():
 def test_registered_tasks_that_extend_each_other_are_refused():
     registry.register("one", {"extends": "two"})
     registry.register("two", {"extends": "one"})
-    with pytest.raises(ConfigError, match="extends: there is no 'one'"):
+    with pytest.raises(ConfigError, match="extends: there is no task or file 'one'"):
         registry.task_config("one")
 
 
@@ -198,7 +198,7 @@ def test_what_cannot_be_extended_is_refused(error, parent):
 def test_a_long_chain_and_a_circle_by_a_detour_end(error):
     for i in range(30):
         written(f"c{i}.yaml", f"extends: c{i + 1}\n")
-    assert "more than 20 files extend each other" in error("--task", "c0.yaml")
+    assert "the chain of `extends` has more than 20 files" in error("--task", "c0.yaml")
     written("sub/file", "")
     written("one.yaml", "extends: sub/../one\n")
     assert "extends itself" in error("--task", "one.yaml")
@@ -318,7 +318,7 @@ def test_a_file_with_the_name_of_a_loaded_module_does_not_replace_it(error):
 @pytest.mark.parametrize(
     ("config", "words"),
     [
-        ("{'extends': 'nothing_like_it'}", "registered config of 'mine': extends: there is no 'nothing_like_it'"),
+        ("{'extends': 'nothing_like'}", "registered config of 'mine': extends: there is no task or file 'nothing_like'"),
         (f"{{'extends': '{TASK}', 'custom': {{'a': object()}}}}", "custom.a: expected numbers, texts"),
         (f"{{'extends': '{TASK}', 'env': {{1: 2}}}}", "env.1: unknown key 1"),
         ("'nowhere.yaml'", "nowhere.yaml: cannot be read"),

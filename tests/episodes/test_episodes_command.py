@@ -129,7 +129,7 @@ def test_without_its_package_a_table_is_refused(monkeypatch, capsys):
     monkeypatch.setattr("legged.cli.episodes.find_spec", lambda _: None)
     assert call(record.main, [*HERE, "--parquet"]) == 2
     assert capsys.readouterr().err == (
-        "error: --parquet: needs pyarrow, which is not installed: pip install 'legged[parquet]'\n"
+        "error: --parquet: needs pyarrow, which is not installed; run `pip install 'legged[parquet]'`\n"
     )
 
 
@@ -161,8 +161,8 @@ def test_two_policies_are_compared(capsys):
         ([*HERE, "--page", "two"], "--page: expected numbers of episodes like 3 or 3,17, got 'two'"),
         ([*HERE, "--page", "7"], "--page: there is no episode 7; episodes are numbered 0 to 2"),
         ([*HERE, "--top", "-1"], "--top: must be at least 0"),
-        ([*HERE, "--command", "1,0,nan"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0,nan'"),
-        ([*HERE, "--command", "1,0"], "--command: expected three numbers of at most 100 like 0.5,0,0.2, got '1,0'"),
+        ([*HERE, "--command", "1,0,nan"], "--command: expected three numbers from -100 to 100 like 0.5,0,0.2; got '1,0,nan'"),
+        ([*HERE, "--command", "1,0"], "--command: expected three numbers from -100 to 100 like 0.5,0,0.2; got '1,0'"),
         ([*HERE, "--terrain", "stares_up"], "--terrain: "),
         ([*HERE, "--as-trained", "--terrain", "pit"], "--terrain: --as-trained takes the ground of the training"),
         ([*HERE, "--difficulty", "2"], "--difficulty: must be between 0 and 1"),

@@ -159,9 +159,9 @@ def test_a_recurrent_policy_begins_each_evaluation_without_memory():
     [
         (
             [("train.runner.stop_at", {"velocity": 0.1})],
-            "stop_at.velocity: evaluations of 'anymal_c_flat' find no 'velocity'",
+            "stop_at.velocity: evaluations of 'anymal_c_flat' report no 'velocity'",
         ),
-        ([("train.runner.best_by", "lin_rmse")], "best_by: .* find no 'lin_rmse'; did you mean 'lin_vel_rmse'"),
+        ([("train.runner.best_by", "lin_rmse")], "best_by: .* report no 'lin_rmse'; did you mean 'lin_vel_rmse'"),
         ([("train.runner.stop_at", {"falls": 0.1})], "stop_at: needs evaluations .* set train.runner.evaluate_interval"),
     ],
 )

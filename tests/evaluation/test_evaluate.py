@@ -301,7 +301,7 @@ def test_evaluations_of_a_shipped_policy_do_not_touch_the_package(tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 cells"),
+        (["--vx=-1:1:1e-9"], "--vx: '-1:1:1e-9' makes 2,000,000,001 values"),
         (["--vx=1e30"], "--vx: '1e30' asks for more than 20"),
         (["--robots", "100000000"], "125 cells x 100,000,000 robots are 12,500,000,000 robots"),
     ],

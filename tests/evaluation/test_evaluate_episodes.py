@@ -159,7 +159,7 @@ def test_controls_are_those_that_the_file_describes(tmp_path):
         (
             {"observation": [{"size": 18, "scale": 1.0}]},
             "HalfCheetah-v5",
-            r"shapes \(\(17,\), \(6,\)\), the policy of \(\(18,\), ",
+            r"differ: HalfCheetah-v5 \(\(17,\), \(6,\)\), policy \(\(18,\), ",
         ),
         ({}, "QuarterCheetah-v5", "has no QuarterCheetah-v5"),
     ],

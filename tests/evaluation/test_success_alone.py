@@ -50,7 +50,7 @@ def test_the_table_and_the_report_of_the_run_are_written(run):
     assert call(report.main, [str(run)]) == 0
     text = (run / "report.md").read_text()
     assert "velocity RMSE" not in text
-    assert "Robots that get out of a tile" in text
+    assert "robots that get out of tiles" in text
 
 
 def test_an_evaluation_that_lost_a_part_of_its_errors_is_damaged():

@@ -82,7 +82,9 @@ def test_a_target_is_reached_when_all_its_figures_are_at_the_same_time():
     assert not evals.why_end
     run(evals, 1)
     assert evals.reached
-    assert evals.why_end.startswith("reached its target after 5 iterations: lin_vel_rmse 0.1 (stop_at 0.2), return -1")
+    assert evals.why_end.startswith(
+        "the training reached its target after 5 iterations: lin_vel_rmse 0.1 (stop_at 0.2), return -1"
+    )
 
 
 def test_who_listens_may_end_a_training():
@@ -164,7 +166,7 @@ def test_the_best_policy_can_be_played_and_trained_on(capsys):
     assert call(evaluate_grid.main, [*flags, "best"]) == 2
     assert f"{plain.name} has no model_best.pt; with train.runner.evaluate_interval" in capsys.readouterr().err
     assert call(evaluate_grid.main, [*flags, "bset"]) == 2
-    assert "'bset' (an iteration, or best)" in capsys.readouterr().err
+    assert "'bset' (allowed: an iteration, or best)" in capsys.readouterr().err
     assert best["iter"] in range(3)
 
 

@@ -268,7 +268,7 @@ def test_each_process_has_the_gpu_of_its_number(monkeypatch):
     for name in (None, "cuda", "cuda:1"):
         assert pick_device(name) == torch.device("cuda:1")
     assert pick_device("cpu") == torch.device("cpu")
-    with pytest.raises(ConfigError, match="one device for 2 processes"):
+    with pytest.raises(ConfigError, match="2 processes would share 'cuda:0'"):
         pick_device("cuda:0")
     as_rank(monkeypatch, 2, 3)
     with pytest.raises(ConfigError, match="3 processes need a GPU each, but torch sees 2"):
@@ -307,5 +307,5 @@ def test_a_number_of_processes_that_was_left_behind_is_named_before_anything_is_
     monkeypatch.setattr("legged.cli.train.make_task", lambda *_, **__: pytest.fail("built"))
     assert call(train.main, ["--task", "anymal_c_flat", "--sim_device", "cpu"]) == 2
     err = capsys.readouterr().err
-    assert "error: WORLD_SIZE: the environment says that 2 processes train together" in err
+    assert "error: WORLD_SIZE: the variable says that 2 processes train together" in err
     assert "MASTER_ADDR" in err

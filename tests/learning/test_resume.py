@@ -90,7 +90,7 @@ def test_without_the_state_robots_begin_anew_and_it_is_said(capsys):
     torch.save({**state, "format": torch.zeros(0)}, folder / "state_2.pt")
     assert "state_2.pt is damaged" in start_anew(capsys, folder, "--max_iterations", "4")
     torch.save({**state, "format": 99}, folder / "state_2.pt")
-    assert "state_2.pt is of format 99, this version reads 2" in start_anew(capsys, folder, "--max_iterations", "4")
+    assert "state_2.pt has format 99, but this version reads format 2" in start_anew(capsys, folder, "--max_iterations", "4")
     (folder / "state_2.pt").write_bytes(b"nonsense")
     assert "state_2.pt: not a checkpoint" in start_anew(capsys, folder, "--max_iterations", "4")
 
@@ -166,7 +166,7 @@ def test_another_robot_is_refused(capsys, tmp_path):
     capsys.readouterr()
     again = ["--task", TASK, "--sim_device", "cpu", "--resume", "--max_iterations", "3", f"robot={tmp_path / 'other'}"]
     assert call(train.main, again) == 2
-    assert "a resumed training keeps its robot, 'anymal_c'" in capsys.readouterr().err
+    assert "a resumed training keeps its robot 'anymal_c'" in capsys.readouterr().err
 
 
 def test_a_robot_that_has_changed_since_is_refused(capsys, tmp_path):

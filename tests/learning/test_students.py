@@ -223,8 +223,8 @@ UNFIT = {
     "robot": (["robot=go2"], "made for another robot: 'anymal_c' with 12 joints"),
     "nobody": (["--teacher", "anymal_x"], "there is no task and no run 'anymal_x'"),
     "divisor": (["train.distillation.gradient_length=3"], "must divide train.runner.num_steps_per_env=4"),
-    "estimator": (["train.policy.estimator.targets=[base_lin_vel]"], "a student learns no estimator"),
-    "std": (["train.policy.state_dependent_std=true"], "a student learns the mean of the actions alone"),
+    "estimator": (["train.policy.estimator.targets=[base_lin_vel]"], "a student can't train an estimator"),
+    "std": (["train.policy.state_dependent_std=true"], "a student learns only the mean of the actions"),
 }
 
 

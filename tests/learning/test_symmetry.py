@@ -182,13 +182,13 @@ def test_own_observations_need_to_say_how_they_are_mirrored():
 def test_lopsided_measuring_points_are_refused(capsys):
     arguments = ["--task", "anymal_c", "train.algorithm.symmetry=true", "terrain.measured_points_y=[0.0, 0.5]", "--show"]
     assert call(train.main, arguments) == 2
-    assert "not the same left and right" in capsys.readouterr().err
+    assert "must be symmetric about 0" in capsys.readouterr().err
 
 
 def test_actions_that_are_scaled_differently_on_both_sides_have_no_images():
     """Half the way for the same action: the mirrored action would ask the other leg for another angle."""
     scales = {"LF": 0.5, "LH": 0.5, "RF": 0.25, "RH": 0.5}
-    words = r"control\.action_scale: is not the same left and right \(LF_HAA 0\.5, RF_HAA 0\.25\); train\.algorithm"
+    words = r"control\.action_scale: left and right joints have different values \(LF_HAA 0\.5, RF_HAA 0\.25\); set train"
     with pytest.raises(ConfigError, match=words):
         small_config(SYMMETRIC, ("control.action_scale", scales))
     small_config(("train.algorithm.symmetry", False), ("control.action_scale", scales))

@@ -275,7 +275,7 @@ def test_a_checkpoint_with_other_actions_is_refused(capsys):
         state[name] = state[name][:6]
     torch.save(saved, source / "model_1.pt")
     error = refused(capsys, "--transfer", str(source))
-    assert f"its policy gives 6 actions, '{OTHER}' takes 12" in error
+    assert f"its policy gives 6 actions, but '{OTHER}' takes 12" in error
 
 
 def test_first_differences_of_terms():

@@ -63,7 +63,7 @@ def test_a_line_that_is_too_steep_for_the_physics_step_is_refused_and_the_number
     with pytest.raises(ConfigError) as error:
         check_actuator(robot, LeggedControlConfig(actuator=ActuatorConfig(**ANYDRIVE)), dt)
     told = re.search(
-        r"^control.actuator.stall_torque: '.._KFE' turns 0.014 kg m\^2 with the leg in the air, .* 120 N m at rest and none "
+        r"^control.actuator.stall_torque: '.._KFE' turns 0.014 kg m\^2 with the leg in the air, .* 120 N m at rest and 0 N m "
         r"at 7.5 rad/s: .* 0.005 s .* \(control.actuator.armature, ([0-9.]+) kg m\^2 or more\), or make sim.dt ([0-9.]+) s",
         str(error.value),
     )

@@ -248,7 +248,7 @@ def test_ranges_and_switches_that_a_fork_does_not_have_are_off(fork, migrated):
 def test_a_fourth_command_and_methods_that_no_setting_carries_over_are_said(fork, migrated):
     out = migrated(textwrap.dedent(CONFIG), path=fork()).out
     where = place(ENV, "def _reward_prance", "dog")
-    assert f"commands: commands[:, 3] is the heading here, and the last command; check _reward_prance ({where})\n" in out
+    assert f"commands: commands[:, 3] is the heading here, and no column follows it; check _reward_prance ({where})\n" in out
     assert f"_resample_commands ({place(ENV, 'def _resample', 'dog')})" in out
     assert "commands.num_commands = 5: commands here are vx, vy, yaw rate and heading" in out
 
@@ -416,9 +416,7 @@ def test_a_robot_whose_feet_have_several_shapes(migrated):
 def test_nothing_is_run_unless_asked_for(capsys):
     written("open('run.txt', 'w').write('x')\n" + BASE + FLAT)
     assert call(migrate.main, ["fork_config.py"]) == 2
-    assert (
-        "legged migrate runs fork_config.py and the modules that it imports; allow this with --run" in capsys.readouterr().err
-    )
+    assert "migrate` runs fork_config.py and the modules that it imports; allow this with --run" in capsys.readouterr().err
     assert not Path("run.txt").exists()
     assert call(migrate.main, ["fork_config.py", "--run"]) == 0
     assert Path("run.txt").exists()

@@ -129,7 +129,7 @@ RANGES = "motor_strength_range = [0.8, 1.2]"
 def test_what_a_fork_draws_of_the_model_is_mapped_or_listed_or_off(migrated, lines, lost, ranges):
     """A range whose switch has another name than the known one was neither in the task nor in the list."""
     result = migrated(sections(domain_rand=lines))
-    also = [name for line in result.lost for name in line.partition("; also ")[2].split(", ") if name]
+    also = [name for line in result.lost for name in line.partition("for the same reason: ")[2].split(", ") if name]
     named = [line.split(": ")[1].partition(" ")[0] for line in result.lost] + also + result.plain
     assert sorted(named) == sorted(f"domain_rand.{line.partition(' ')[0]}" for line in lost)
     assert result.data.get("domain_rand", {}).get("ranges") == ranges

@@ -147,7 +147,7 @@ HERE = ["{policy}", "--robot", "anymal_c"]
             ["{policy}", "--robot", "anymal_cc", "--layout", "holosoma"],
             "--robot: there is no robot 'anymal_cc'; did you mean 'anymal_c'?",
         ),
-        (["{policy}", "--layout", "holosoma"], "--robot: is missing; name one, because the layout 'holosoma' does not"),
+        (["{policy}", "--layout", "holosoma"], "--robot: is missing; name a robot, because the layout 'holosoma' names none"),
         (["{policy}", "--robot", "anymal_c"], "there is no policy.json next to it"),
         (["{policy}", "--robot", "g1", "--layout", "holosoma"], "takes 49 numbers, but the layout's observation has 100"),
         ([*HERE, "--layout", "holosomo"], "--layout: there is no layout 'holosomo'"),
@@ -177,7 +177,7 @@ def test_metadata_that_does_not_fit_the_robot(policy_file):
     matrix, bias = np.zeros((WIDTH, 12)), np.zeros(12)
     for metadata, message in (
         ({"dof_names": ["LF_HAA", "knee"]}, "robot 'anymal_c' has no joint 'knee'"),
-        ({"dof_names": ["LF_HAA", "LF_HFE"]}, "it names 2 joints, but 'anymal_c' has 12"),
+        ({"dof_names": ["LF_HAA", "LF_HFE"]}, "names 2 joints, but 'anymal_c' has 12"),
         ({"kp": [1.0, 2.0]}, "metadata kp/stiffness/joint_stiffness: expected 12 numbers"),
         ({"kd": 3}, "metadata kd: expected a list"),
     ):

@@ -212,9 +212,9 @@ def test_the_first_that_follows(standing, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--rmse", "0.2"], "--rmse: limits the error on a grid"),
+        (["--rmse", "0.2"], "--rmse: has no effect without a grid"),
         (["--vx=0", "--rmse", "-1"], "--rmse: must be above 0"),
-        (["--vx=0", "--command", "0,0,0"], "--command: replaces a grid"),
+        (["--vx=0", "--command", "0,0,0"], "--command: cannot be combined with a grid"),
         (["--vx=1:0:0.5"], "--vx: '1:0:0.5' is not of the form"),
         (["--vx=0", "--seconds", "1"], "--seconds: must be above 1"),
         (["--vx=-1:1:0.01", "--vy=-1:1:0.01"], "commands; at most 10,000"),

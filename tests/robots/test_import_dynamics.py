@@ -52,7 +52,7 @@ def test_what_is_kept_has_none(tmp_path):
     ("parts", "says"),
     [
         # At 90 degrees each, a band of 15 N/rad pulls with 15 pi N m on both joints.
-        ({"tendon": TENDON.format('stiffness="15"')}, r"'a' would lack up to .* of 20 N m .*tendons are left out: band"),
+        ({"tendon": TENDON.format('stiffness="15"')}, r"'a' would lack up to .* of 20 N m.*tendons are left out: band"),
         ({"joint": 'stiffness="1 30"'}, r"joint 'a' would lack up to .* of 20 N m"),
         ({"body": 'gravcomp="1"'}, r"(the base|joint 'b') would lack up to"),
         (

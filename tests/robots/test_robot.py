@@ -254,7 +254,7 @@ def test_misspelt_robot_is_an_error_that_suggests_the_right_name():
         ("velocity_limit: {HAA: 20.0", "velocity_limit: {HAA: .nan", "velocity_limit.HAA: expected a number"),
         ("  HAA: 0.0", "  HAA: 1e300", "default_joint_angles.HAA: must be at most 100"),
         ("  HAA: 0.0", "  HAA: 0.0\n  '': 0.0", "default_joint_angles: an empty pattern would match everything"),
-        ("  HAA: 0.0", "  HAA: 0.0\n  1: 0.0", "default_joint_angles: expected text for a key, not 1"),
+        ("  HAA: 0.0", "  HAA: 0.0\n  1: 0.0", "default_joint_angles: expected a mapping whose keys are text (one key is 1)"),
         ("feet: [FOOT]", "feet: []", "feet: must not be empty"),
         ("feet: [FOOT]", "feet: ['']", "feet: an empty pattern would match everything"),
         ("feet: [FOOT]", "feet: FOOT", "feet: expected a list, got 'FOOT'"),
@@ -283,7 +283,7 @@ def test_collision_bits_that_meet_no_ground_have_a_line(folder):
     assert not load_robot(str(folder)).adaptations
     edit(folder / "anymal_c.xml", 'contype="1" conaffinity="2"', 'contype="4" conaffinity="8"')
     (line,) = load_robot(str(folder)).adaptations
-    assert line.startswith("shapes collide with the ground, although their own collision bits would not allow it: base")
+    assert line.startswith("shapes collide with the ground, although their contype and conaffinity exclude it: base")
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,7 @@ def test_links_without_mass(read):
     [
         # C is 0.01 above A + B: each of these is raised by half of that.
         ((0.01, 0.02, 0.04), (0.015, 0.025, 0.04), "breaks A + B >= C by 25.0%"),
-        ((-0.01, 0.03, 0.03), (3e-5, 0.03, 0.03), "is not above 0"),
+        ((-0.01, 0.03, 0.03), (3e-5, 0.03, 0.03), "has a moment that is not above 0"),
     ],
 )
 def test_impossible_inertias_are_mended_and_named(read, moments, expected, why):
@@ -308,7 +308,7 @@ def test_a_mesh_that_is_missing_or_of_a_kind_that_nobody_reads_is_left_out(read,
     child = f'<inertial><mass value="1"/>{UNIT}</inertial>{visuals}'
     tree = read(urdf(arm(child=child)))
     line = said(tree, "visual meshes are left out")
-    assert "nice.dae: MuJoCo does not read .dae; pip install trimesh pycollada" in line
+    assert "nice.dae: MuJoCo does not read .dae; run `pip install trimesh pycollada`" in line
     missing = said(tree, "visual meshes that are not found")
     assert (
         missing == "visual meshes that are not found in the folders around the file are left out: package://toy/nowhere.stl"
@@ -327,7 +327,7 @@ def test_a_mesh_that_is_missing_or_of_a_kind_that_nobody_reads_is_left_out(read,
         ('<parent link="trunk"/><child link="fl_hip"/>', '<parent link="trunk"/><child link="fr_hip"/>', "child of several"),
         ('<mass value="6"/>', '<mass value="six"/>', "<mass>: value: expected a number, got 'six'"),
         ('<mass value="6"/>', '<mass value="-6"/>', "link 'trunk': mass: must not be below 0, got -6"),
-        ('<mass value="6"/>', "", "the base, link 'trunk', has no mass"),
+        ('<mass value="6"/>', "", "the base, link 'trunk', and the links"),
         ('xyz="0.2 0.1 0"', 'xyz="0.2 0.1"', "<origin>: xyz: expected 3 numbers, got '0.2 0.1'"),
         ('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/>', "joint 'fl_hip': axis: must have a length"),
         ('upper="0.8"', 'upper="0.8."', "<limit>: upper: expected a number, got '0.8.'"),

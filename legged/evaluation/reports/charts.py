@@ -23,7 +23,7 @@ WIDTH, HEIGHT = 480.0, 250.0
 LEFT, RIGHT, TOP, BOTTOM = 58.0, 14.0, 30.0, 42.0
 """Margins around the axes [SVG units]."""
 MOST_POINTS = 240
-"""Largest number of points of a line. Points of longer lines are averaged, because a drawing has hardly more pixels."""
+"""Largest number of points of a line. In longer lines neighbours are averaged, because a chart is about 400 pixels wide."""
 LETTER = 6.3
 """Mean width of a letter of the legend [SVG units]."""
 INK, QUIET, GRID, REST = "#1b1f24", "#57606a", "#e1e5e9", "#9aa4ae"
@@ -47,14 +47,14 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines over one x axis, and how their axes are labelled."""
+    """Lines over one x axis, and the labels and scales of the axes."""
 
     title: str
     """Quantity on the y axis, with its unit."""
     x_label: str
     lines: Sequence[Line] = ()
     unit: str = "iteration"
-    """Name of the quantity x, which the page's script shows next to a value of x."""
+    """Name of the quantity on the x axis. The page's script shows this name next to a value of x."""
     log: bool = False
     percent: bool = False
     """True: y is a share, and its axis ends at 100 %."""
@@ -157,7 +157,7 @@ def curves(chart: Chart) -> str:
 
 
 def stacked(chart: Chart, x: np.ndarray, parts: dict[str, np.ndarray]) -> str:
-    """Return an SVG of `parts` (n,) over x (n,) as stacked areas, with a line for their sum. Negative values lie below 0."""
+    """Return an SVG of `parts` (n,) over x (n,) as areas, with a line for their sum. Negative values stack downwards."""
     x, *values = _thinned(x, *parts.values())
     ups, downs = (np.cumsum([np.zeros(len(x)), *(of(v, 0.0) for v in values)], axis=0) for of in (np.maximum, np.minimum))
     sums = replace(chart, lines=[Line("", x, edge) for edge in (ups[-1], downs[-1])])
@@ -256,7 +256,7 @@ class _Frame:
         self.marks.append({"kind": "line", **look, **self.data(line, color)})
 
     def data(self, line: Line, color: str) -> dict[str, str]:
-        """Return the attributes of a line that the page's script reads: name, colour, x, and the values at each x."""
+        """Return the attributes that the page's script reads from a line: its name, colour and x, and its value at each x."""
         values, unit = (100.0 * line.y, "\u00a0%") if self.chart.percent else (line.y, "")
         x, v = " ".join(f"{value:.6g}" for value in line.x), " ".join(f"{value:.4g}{unit}" for value in values)
         return {"name": line.name or self.chart.title, "color": color, "x": x, "v": v}
@@ -316,7 +316,7 @@ def ticks(low: float, high: float, count: int) -> list[float]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """Return the powers of ten from `low` to `high`. If there are few, 2 and 5 times the powers are added."""
+    """Return the powers of ten from `low` to `high`. If there are few powers, their products with 2 and with 5 are added."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     factors = (1, 2, 5) if high / low < 200.0 else (1,)
     return [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]

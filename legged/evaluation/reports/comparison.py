@@ -1,5 +1,5 @@
-"""Comparisons of evaluations, in tables for the screen, and of runs, on a page with settings, curves and evaluations. In the
-tables, evaluations of one task in one engine under the same conditions count as those of different seeds.
+"""Tables for the screen that compare evaluations, and a page that compares settings, curves and evaluations of runs. In the
+tables, evaluations with the same task, engine and conditions are taken as those of policies trained with different seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,11 +49,11 @@ FIGURES = {
 Counted = dict[tuple[float, ...], float] | tuple[float, float, int] | tuple[int, int] | float | None
 """A figure of a run: command -> error; (mean, sample standard deviation, count); (successes, trials); or a number."""
 Measured = tuple[float, Interval | None] | None
-"""A figure and its confidence interval (None if it has none); None instead of both if a run lacks the figure."""
+"""A figure and its confidence interval, which may be None. If a run lacks the figure, None stands for both."""
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
-    """Remove all terrain types but `types` from the results, in place, and put the kept ones in the order of `types`.
+    """Change the results in place: keep only the terrain types in `types`, in the order of `types`.
 
     Raises:
         ConfigError: one of the types is in no result.
@@ -101,14 +101,14 @@ def tracking_table(groups: Evaluations) -> ScreenTable:
         row = [label]
         for results in groups.values():
             found = [value_at(tracking_of(result), path) for result in results if has_tracking(result)]
-            values = [factor * value for value in found if value is not None]  # null if every robot fell
+            values = [factor * value for value in found if value is not None]  # a value is None if every robot fell
             row.append(_mean_text(values, len(results), form, f"{100 * spread(values):.0f} %") if values else "none")
         rows.append(row)
-    return screen_table("following commands: mean of seeds (farthest from it)", ["measure", *_heads(groups)], rows)
+    return screen_table("following commands: mean of seeds (largest deviation)", ["measure", *_heads(groups)], rows)
 
 
 def episodes_comparison(groups: Evaluations) -> ScreenTable:
-    """Return a table of evaluations of episodes with one column for each group: the mean over its seeds and their range."""
+    """Return a table of evaluations of episodes. It has a column for each group, with the mean and the range over seeds."""
     found = [[_episode_figures(result["episodes"]) for result in results] for results in groups.values()]
     rows = []
     for label in dict.fromkeys(label for seeds in found for seed in seeds for label in seed):
@@ -126,7 +126,7 @@ def _heads(groups: Evaluations) -> list[str]:
 
 
 def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
-    """Return the mean of `values` as text. Brackets hold `spread_text`, and the number of values if seeds lack a value."""
+    """Return the mean of `values` as text. Brackets hold `spread_text`, and the number of values if seeds have no value."""
     notes = [spread_text] if len(values) > 1 else []
     notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
     return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
@@ -157,7 +157,9 @@ def heading(key: Key, seeds: int) -> str:
 
 
 def shares(results: Sequence[dict[str, Any]], terrain: str) -> dict[float, list[float]]:
-    """Return size -> share of successful robots for each seed measured on `terrain`, for sizes that all these seeds have."""
+    """Return size -> shares of successful robots, one share for each seed that was measured on `terrain`. Sizes that one of
+    these seeds lacks are left out.
+    """
     entries = [types_in(result)[terrain] for result in results if terrain in types_in(result)]
     found = [{point["size"]: point["share"] for point in entry["points"]} for entry in entries]
     common = set.intersection(*(set(one) for one in found)) if found else set()
@@ -171,7 +173,7 @@ def types_of(groups: Evaluations) -> dict[str, dict[str, Any]]:
 
 
 def success_table(groups: Evaluations) -> ScreenTable:
-    """Return a table with one line for each type and size: the mean success over seeds and their range."""
+    """Return a table with a line for each terrain type and size: the mean success of each group's seeds, and its range."""
     rows: list[list[str] | None] = []
     for name, entry in types_of(groups).items():
         columns = [(shares(results, name), len(results)) for results in groups.values()]
@@ -235,7 +237,7 @@ def apart(names: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
-    """Return tables and drawings of the evaluations in each engine in which at least two runs were evaluated."""
+    """Return tables and drawings of the evaluations, for each engine that has evaluations of at least two runs."""
     parts: list[Part] = []
     for engine in by_engine(result for record in records for result in record.results.values()):
         results = [record.results.get(engine) for record in records]
@@ -243,7 +245,7 @@ def _evaluations(names: Sequence[str], records: Sequence[Record]) -> list[Part]:
             continue
         parts += [Heading(f"Evaluation in {engine_of(engine).label}"), _table(names, results)]
         others = [(name, record.another_policy(one)) for name, record, one in zip(names, records, results, strict=True)]
-        parts += [Paragraph(f"{name}: evaluated is `{file}`, which is not its last policy.") for name, file in others if file]
+        parts += [Paragraph(f"{name}: the evaluation is of `{file}`, not the last policy.") for name, file in others if file]
         for name, (changed, grid) in zip(names, conditions_of(results), strict=True):
             told = "; ".join([*([f"made with {changed}"] if changed else []), *([f"on {grid}"] if grid else [])])
             parts += [Paragraph(f"{name}: {told}.")] if told else []

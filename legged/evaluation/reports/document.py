@@ -1,4 +1,4 @@
-"""Pages that consist of parts, written as one self-contained HTML file, and as Markdown with pictures in separate files."""
+"""Pages that consist of parts. A page is a self-contained HTML file, and a Markdown file with pictures in separate files."""
 
 import base64
 import math

@@ -64,7 +64,7 @@ def _shared_row(group: Sequence[Record], beside: Path, ending: str) -> dict[str,
 
 
 def _row(record: Record, beside: Path, ending: str) -> dict[str, Cell]:
-    """Return column -> cell for a run. Evaluated figures are from the first engine of ENGINES in which it was evaluated."""
+    """Return column -> cell for a run. Evaluated figures are from the run's first evaluation in the order of ENGINES."""
     timing = record.timing
     judged = next(iter(record.results.values()), {})
     return {
@@ -104,8 +104,8 @@ def _figures(record: Record, judged: dict[str, Any]) -> dict[str, tuple[float | 
 
 
 def highest_stairs(result: dict[str, Any]) -> float | None:
-    """Return the height of the highest stair steps [m] such that the robots crossed these and all lower ones, up and down.
-    Return 0 if they did not cross the lowest steps, and None without evaluations in both directions.
+    """Return the height of the highest stair steps [m] that the robots crossed both up and down. They must have crossed all
+    lower steps too. Return 0 if they did not cross the lowest steps, and None if they were not evaluated in both directions.
     """
     points = [types_in(result).get(name, {}).get("points", []) for name in STAIRS]
     ways = [{point["size"]: point["share"] for point in of_type} for of_type in points]

@@ -67,7 +67,7 @@ class Record:
 
     folder: Path
     config: dict[str, Any]
-    """The complete configuration. Its fields have the names of this version, unless this version cannot read the file."""
+    """The complete configuration with this version's field names, or the file's names if this version can't read the file."""
     began: datetime
     timing: Timing | None
     scalars: Scalars
@@ -81,7 +81,7 @@ class Record:
     why: str
     """Details of the status."""
     done: int
-    """Number of iterations up to the last checkpoint or log entry, with those before the run was resumed."""
+    """Number of iterations up to the last checkpoint or log entry. Iterations before the run was resumed are counted too."""
     problems: tuple[str, ...]
     """Reasons why parts could not be read."""
     given: Invocation | None = None
@@ -201,8 +201,9 @@ def _status(folder: Path, timing: Timing | None, until: Any, done: int, saved: i
 
 
 def is_running(folder: Path) -> bool:
-    """Return whether the process that writes a run's log is alive. On this machine it is looked up by its id, which is in the
-    log's name (events.out.tfevents.<time>.<host>.<process>.<file>). On another machine the log must have changed recently.
+    """Return whether the process that writes a run's log is alive. The log's name holds the host and the id of
+    the process (events.out.tfevents.<time>.<host>.<process>.<file>). On this machine a process with this id must exist, and
+    the log must have changed within QUIET_S. On another machine the log must have changed within QUIET_ELSEWHERE_S.
     """
     for path in folder.glob("events.out.tfevents.*"):
         match = re.fullmatch(r"events\.out\.tfevents\.\d+\.(.*)\.(\d+)\.\d+", path.name)
@@ -242,8 +243,8 @@ def read_note(folder: Path) -> str:
 
 
 def from_task_file(record: Record) -> dict[str, list[Any]] | None:
-    """Return setting -> [the run's value, the value in the task's files], for settings that differ; None if there is no such
-    task. If the run's device is not known, the task's settings for CPU or for GPU are used, whichever differ less.
+    """Return setting -> [the run's value, the value in the task's files], for settings that differ; None if the run's task is
+    unknown. If the run's device is unknown, take the task's settings for CPU or for GPU: those that differ less from the run.
     """
     where = [record.timing.device == "cpu"] if record.timing else [False, True]
     try:

@@ -56,11 +56,12 @@ FILMING: list[subprocess.Popen] = []
 LONGEST_DIFF = 200_000
 """Largest number of letters of a code diff in the page; CODE_FILE holds the whole diff."""
 ON_GRID = (
-    "Without noise and pushes, on a grid of commands: root mean square of the error over time, mean of the cells. The"
-    " interval of falls is Wilson's. A cell of the maps is the mean over the third command."
+    "Measured on a grid of commands, without noise and pushes. Errors are root mean squares over time, averaged over the"
+    " commands. The interval of falls is Wilson's. The maps show means over the command that has no axis."
 )
 ON_TERRAIN = (
-    "Robots that get out of a tile of each size, with Wilson's 95 % interval. A dotted line marks the hardest of training."
+    "Share of robots that get out of tiles of each difficulty, with Wilson's 95 % interval. A dotted line marks the most"
+    " difficult tiles of the training."
 )
 OVER_TRAINING = {
     "Train/mean_reward": ("return", 1.0, ".2f"),
@@ -109,7 +110,7 @@ def report_parts(record: Record) -> list[Part]:
 
 
 def command_on(record: Record, command: str) -> str:
-    """Return the shell command `legged COMMAND RUN`, with the option that names the folder of a user-defined task."""
+    """Return the shell command `legged COMMAND RUN`, with the option `--import` if the run's task is user-defined."""
     given = Invocation(record.task) if record.given is None else record.given
     return shlex.join(["legged", *command.split(), *given.flags, relative(record.folder)])
 
@@ -148,7 +149,7 @@ def _facts(record: Record) -> list[list[Cell]]:
 
 
 def _film(record: Record) -> list[Part]:
-    """Return the first film of the policy that exists, or a sentence that names the film if it is too large to show."""
+    """Return the first of FILMS in the run folder. If that film is too large to show, return a sentence with its name."""
     for film in (record.folder / name for name in FILMS):
         with suppress(OSError):
             size = film.stat().st_size
@@ -161,8 +162,8 @@ def _film(record: Record) -> list[Part]:
 def _differences(record: Record) -> list[Part]:
     heading, found = Heading("Settings other than the task's"), from_task_file(record)
     if found is None:
-        told = f", and `{command_on(record, 'runs report')}` says where it is" if record.given is not None else ""
-        text = f"There is no task '{record.task}' here to compare with{told}; config.yaml has all settings."
+        told = f". Where it exists, `{command_on(record, 'runs report')}` can compare" if record.given is not None else ""
+        text = f"There is no task '{record.task}' here to compare with{told}. config.yaml has all settings."
         set_there: list[list[Cell]] = [[Mono(path), Mono(words(value))] for path, value in record.changes.items()]
         return [heading, Paragraph(text), *([Table(["setting", "the command line"], set_there)] if set_there else [])]
     if not found:
@@ -228,7 +229,7 @@ def _evaluations(record: Record) -> list[Part]:
 
 
 def _heat_maps(tracking: dict[str, Any], label: str) -> list[str]:
-    """Return heat maps (SVG) of errors over commands; an empty list if the file lacks the cells."""
+    """Return heat maps (SVG) of the errors over the commands; an empty list if `tracking` lacks its grid or its `cells`."""
     try:
         grid, found = tracking["grid"], []
         for name, over, other, title in PANELS:

@@ -1,4 +1,4 @@
-"""The stress test's table of disturbances, which is scaled to the robot's size, and a task with disturbed robots."""
+"""The stress test's table of disturbances, and a task whose robots have these disturbances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -19,34 +19,34 @@ from legged.robots.similarity import Size, grown
 from legged.terrain import Terrain
 
 WRITTEN_FOR = "anymal_c"
-"""Robot for which the numbers of the table are written. They are scaled for other robots."""
+"""Robot for which the numbers of the table are written. For other robots these numbers are scaled."""
 
 PUSH_INTERVAL = 5.0
 """Time between two pushes of a robot [s]."""
 
 
 def _told(text: str, unit: str = "", default: float | None = 0.0) -> Any:
-    """Return a dataclass field whose value is described by `text`, with `{}` in place of the value. A value with a `unit` is
-    scaled to the robot's size; delays, angles and shares are not, so they have no `unit`.
+    """Return a dataclass field. `text` describes its value, with `{}` in place of the value. A value with a `unit` is scaled
+    to the robot's size. Delays, angles and shares are not scaled, so they have no `unit`.
     """
     return field(default=default, metadata={"text": text, "unit": unit})
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbances of one robot, its sensors and its motors. "Either way" means with a positive or a negative sign."""
+    """Disturbances of one robot, its sensors and its motors. In the fields, "either way" means that the sign is random."""
 
     name: str
     payload: float = _told("{:g} kg on the base", "kg")
     """Mass added to the base, at its centre of mass [kg]."""
     friction: float | None = _told("friction {:g}", default=None)
-    """Sliding friction of all contacts of the robot; None keeps the nominal friction [1]."""
+    """Coefficient of sliding friction of all contacts of the robot [1]. None keeps the nominal friction."""
     motors: float = _told("motors at {:.0%}", default=1.0)
     """Factor on every motor's torque and torque limit [1]."""
     delay: float = _told("targets {:g} s late")
     """Delay of the targets on the way to the motors [s]."""
     push: float = _told(f"velocity set to up to {{:g}} m/s every {PUSH_INTERVAL:g} s", "m/s")
-    """Every PUSH_INTERVAL the base gets a random velocity along the world's x and y, up to this, either way [m/s]."""
+    """Largest velocity that a push gives the base along the world's x and y, either way [m/s]. The velocity is random."""
     zero_offset: float = _told("encoders up to {:g} rad off")
     """Largest random error of the encoders, either way [rad]. Policy and motors both use the wrong angles."""
     tilt: float = _told("inertial sensor askew by {:g} rad")
@@ -56,7 +56,7 @@ class Disturbance:
     map_shift: float = _told("height map shifted by {:g} m", "m")
     """Horizontal error of the height map, in a random direction [m]."""
     map_holes: float = _told("{:.0%} of the height map missing")
-    """Share of the points of the height map that are missing [1]. They read 0, like level ground."""
+    """Share of the height map's points that are missing [1]. Missing points read 0, like level ground."""
 
     @property
     def changes(self) -> dict[str, float]:
@@ -90,9 +90,9 @@ ALONE = (
 )
 """Single disturbances, with numbers for an ANYmal C."""
 TOGETHER = ("payload", "friction", "weak motors", "delay 20 ms")
-"""Disturbances of the line `together`, which are common on hardware."""
+"""Disturbances that the line `together` combines. They are common on hardware."""
 WORST = ("delay 40 ms", "no map")
-"""Disturbances that are left out of the line `everything`, because it has a weaker one of the same kind."""
+"""Disturbances that the line `everything` leaves out. This line has weaker disturbances of the same kinds."""
 
 NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
 """Names of all lines of the table."""
@@ -100,7 +100,7 @@ NAMES = (NOMINAL.name, *(one.name for one in ALONE), "together", "everything")
 
 def table(robot: Size, anymal: Size, payload: float | None = None) -> tuple[Disturbance, ...]:
     """Return all lines of the table for a robot of the size `robot`: no disturbance, each of ALONE, `together`, `everything`.
-    Numbers are scaled from the size `anymal` and rounded to two digits. A `payload` [kg] replaces that of ALONE.
+    Numbers are scaled from the size `anymal` and rounded to two digits. A `payload` [kg] replaces the payload in ALONE.
     """
     alone = [scaled(one, robot, anymal) for one in ALONE]
     if payload is not None:
@@ -121,7 +121,7 @@ def scaled(one: Disturbance, robot: Size, anymal: Size) -> Disturbance:
 
 
 def combined(name: str, parts: Sequence[Disturbance]) -> Disturbance:
-    """Return one disturbance called `name` with the changed fields of all `parts`, which must not change the same field."""
+    """Return the disturbance `name` with the changed fields of all `parts`. Two parts must not change the same field."""
     return Disturbance(name, **{key: value for part in parts for key, value in part.changes.items()})
 
 
@@ -162,7 +162,7 @@ def make_stressed(
     kind: Any = task_class(cfg.task)
     own = {"rows": tuple(rows), "own_delay": cfg.control.actuator.delay, "__module__": __name__}
     stressed: Any = type(f"Stressed{kind.__name__}", (StressedTask, kind), own)
-    other_ground = {} if terrain is None else {"terrain": terrain}  # a user-defined task may not accept the argument
+    other_ground = {} if terrain is None else {"terrain": terrain}  # a user-defined task may lack this argument
     return stressed(override(cfg, late(rows, cfg)), device, graph, **other_ground)  # type: ignore[no-any-return]
 
 
@@ -178,8 +178,8 @@ class GivenMap(HeightMapErrors):
 
 
 class StressedTask(LeggedRobot):
-    """A mix-in that gives each robot its own disturbance; it comes before the task's class. The disturbances' random numbers
-    come from a separate generator and are drawn once, so the task's other random numbers stay the same.
+    """A mix-in that gives each robot its own disturbance. The mix-in is the first base class, before the task's class. The
+    disturbances' random numbers come from a separate generator, so the task's other random numbers stay the same.
     """
 
     rows: tuple[Disturbance, ...] = ()
@@ -244,7 +244,7 @@ class StressedTask(LeggedRobot):
             self.control.actuator.delay.copy_(torch.where(steps > 0.0, steps, own))
 
     def make_height_map(self) -> HeightMapErrors | None:
-        """Return a height map with the errors of the robots' disturbances, or None if they have none."""
+        """Return the height map's errors for the robots' disturbances, or None if the height map is exact."""
         cfg, n = self.cfg.observations.height_map, self.num_envs
         if is_exact(cfg):
             return None

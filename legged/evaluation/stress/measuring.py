@@ -1,4 +1,4 @@
-"""The stress test: disturbances on stairs and on the flat, new ground, and other solvers; measured, printed and drawn."""
+"""Run the stress test: measure a policy under disturbances, on new ground and with other solvers, and show the results."""
 
 import gc
 import time
@@ -45,21 +45,21 @@ from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 RISER = 0.17
 """Height of the stairs' steps at terrain.scale 1 [m]."""
 TREAD = 0.28
-"""Width of the stairs' steps [m]. It is that of stairs in houses, and is not scaled to the robot's size."""
+"""Width of the stairs' steps [m], as on stairs in houses. This width is not scaled to the robot's size."""
 STAIRS = ("stairs_up", "stairs_down")
 """Terrain types of the stairs: half of the robots go up, half go down."""
 GROUND = {"dense_blocks": 0.25, "kerbs": 0.17, "rubble": 0.2}
 """Terrain type that no task is trained on -> its size at terrain.scale 1 [m]."""
 HOLD_S, SETTLE_S = 6.0, 1.0
-"""Time for which a command is held on the flat, and time at the start of a command that is not measured [s]."""
+"""Duration of a command on the flat, and duration of its first part, in which errors are not measured [s]."""
 LIMIT = 0.25
 """Largest RMS velocity error with which a robot counts as following its command, at terrain.scale 1 [m/s]."""
 COMMANDS = (
     *((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)),
     *((0.5, 0.0, 0.5), (0.5, 0.0, -0.5)),
 )
-"""Commands on the flat (vx, vy, yaw rate): positive numbers are shares of the highest value of the grid's axis, negative ones
-of the lowest value. The robots of a line get the commands in turn."""
+"""Commands on the flat (vx, vy, yaw rate), as shares of the limits in the section `evaluation`. A positive number is a share
+of the highest value, a negative number is a share of the lowest. The robots of a line get the commands in turn."""
 Changes = Sequence[tuple[str, Any]]
 """Overrides of a configuration."""
 HALF_STEP = "half the time step"
@@ -69,7 +69,7 @@ COLORS = {"table": "#0072B2", "combined": "#D55E00", "settings": "#009E73", "gro
 LABELS = {"table": "one disturbance", "combined": "several", "settings": "another solver", "ground": "new ground"}
 COMBINED = ("together", "everything")
 SETTING_LINES = ("nominal", "together")
-"""Lines of the table that are measured with each solver setting. With `full` all lines are measured."""
+"""Lines of the table that are measured with each solver setting. With `--full` all lines are measured."""
 
 
 def settings(cfg: LeggedConfig, engine: str) -> dict[str, list[tuple[str, Any]]]:
@@ -95,7 +95,7 @@ def check_asked(changes: Changes) -> None:
         for name in names if key.startswith(ranges) else ():
             if name in GIVEN:
                 where = f"command line: {ranges}.{name}"
-                raise ConfigError(f"{where}: legged evaluate stress sets this property itself; leave it out")
+                raise ConfigError(f"{where}: leave it out, because `legged evaluate stress` sets this property")
 
 
 class Bench:
@@ -188,7 +188,7 @@ class Bench:
         """Build a task with one robot for each of `rows`, and its policy. The overrides `own` apply first, then the user's,
         then `last`, so that a solver setting in `last` replaces the user's.
         """
-        gc.collect()  # frees the previous task, which is in a reference cycle: a GPU may not have the memory for two tasks
+        gc.collect()  # the previous task is in a reference cycle, and a GPU may not have the memory for two tasks
         changes = [*own, *declared(rows), *self.setting.asked, *last]
         make = partial(make_stressed, rows)
         return restore(self.setting.policy, changes, self.setting.device, self.setting.graph, terrain, make)
@@ -258,7 +258,7 @@ def evaluate_stress(bench: Bench, full: bool) -> int:
     others = {}
     tried = settings(bench.cfg, engine) if full or bench.whole else {}
     if tried and HALF_STEP not in tried:
-        print(f"{HALF_STEP}: left out; the LSTM in control.actuator.network works with one time step only", flush=True)
+        print(f"{HALF_STEP}: left out, because the LSTM in control.actuator.network fits one time step only", flush=True)
     for name, changes in tried.items():
         print(f"{name}: {len(few)} lines", flush=True)
         others[name] = bench.measure(few, changes)

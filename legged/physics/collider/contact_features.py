@@ -1,9 +1,10 @@
-"""Contact features: the parts of shapes that are tested against a height map. They are points with a radius, segments of
+"""Contact features: the parts of shapes that are tested against a height map. Features are points with a radius, segments of
 capsules, and rim points and end discs of cylinders.
 
 A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
-surface with points of its rims: those on which it would rest on a plane that has the slope of the ground under its centre. It
-touches vertical faces and their rims with the discs at its two ends and, like a capsule, with the segment between the ends.
+surface with the four points of its rims on which it would rest on a plane. This plane has the slope of the ground under the
+cylinder's centre. The cylinder touches vertical faces and their rims with the discs at its ends and, like a capsule, with the
+segment between the ends.
 """
 
 from collections.abc import Iterable, Iterator
@@ -31,18 +32,18 @@ cylinder's axis is larger than this."""
 
 @dataclass(frozen=True)
 class ContactFeature:
-    """Part of a geom that is tested against the height map, in the geom's frame [m]."""
+    """Contact feature of a geom. `start` and `end` are given in the geom's frame [m]; their meaning depends on `kind`."""
 
     geom: int
     kind: int
     start: np.ndarray
     end: np.ndarray
     radius: float
-    """Radius around the feature; 0 for corners, rim points and discs."""
+    """Radius around the feature [m]; 0 for corners, rim points and discs."""
 
     @property
     def reach(self) -> float:
-        """Largest distance from the feature's centre to a point that the feature can touch [m]."""
+        """Largest distance from the feature's point, segment or disc centre to ground that the feature can touch [m]."""
         return float(self.end[0]) if self.kind == DISC else self.radius
 
     @property
@@ -79,13 +80,14 @@ def contact_features(model: mujoco.MjModel, shapes: Iterable[int]) -> Iterator[C
         else:
             raise ConfigError(
                 f"terrain: shape '{model.geom(i).name}' is of type {kind_of(model, i)}; sim.terrain_collider=cells"
-                " supports spheres, capsules, cylinders, boxes; use them, sim.terrain_collider=convex or sim.physics=mujoco"
+                " supports only spheres, capsules, cylinders and boxes; use one of these types, or set"
+                " sim.terrain_collider=convex or sim.physics=mujoco"
             )
 
 
 @wp.func
 def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, margin: float, hits: Hits, row: int) -> int:
-    """Write a thin disc's possible contacts with vertical faces and rims to row `row` of `hits`. Return their number."""
+    """Find a thin disc's possible contacts with vertical faces and rims. Write them to row `row`, and return their number."""
     found = around_point(ground, centre, radius + margin, True, hits, row)
     count = wp.int32(0)
     for k in range(found):
@@ -132,8 +134,8 @@ def find_hits(
     hits: Hits,
     row: int,
 ) -> int:
-    """Find the possible contacts of a geom's feature with ground nearer than `near` [m], the sum of the feature's radius and
-    the contact margin. Write them to row `row` of `hits`, without subtracting the radius from distances. Return their number.
+    """Find the possible contacts of a geom's feature with ground within `near` [m] of it (feature radius + contact margin).
+    Write the contacts to row `row` of `hits`, and return their number. The radius is not subtracted from distances.
     """
     if kind == BETWEEN:
         return between_ends(ground, position + turn * start, position + turn * end, near, hits, row)

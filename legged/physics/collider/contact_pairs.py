@@ -1,4 +1,4 @@
-"""Pairs of shapes that may touch, and their contact parameters, which are computed on the host as in MuJoCo."""
+"""Pairs of shapes that may touch, and their contact parameters. The host computes the parameters by MuJoCo's rules."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ ROUND = (int(KINDS.mjGEOM_SPHERE), int(KINDS.mjGEOM_CAPSULE))
 ON_PLANES = (*ROUND, int(KINDS.mjGEOM_ELLIPSOID), int(KINDS.mjGEOM_CYLINDER), int(KINDS.mjGEOM_BOX))
 """Types of shapes that touch a plane in a few points."""
 POINT, END, CORNER, RIM, ELLIPSOID = range(5)
-"""Kinds of points of a shape that may touch a plane. POINT: at `place`, with a radius. END: an end of a capsule, with the
-capsule's radius; one direction of friction lies along the capsule's axis. CORNER: a corner of a box; it counts only if it is
-below the box's centre. RIM: one of the four points on which a cylinder rests; `radius` is the number of the point. ELLIPSOID:
-the lowest point of an ellipsoid."""
+"""Kinds of a shape's points that may touch a plane (`PlanePoint`). POINT: at `place`, with a radius. END: an end of a
+capsule, with the capsule's radius; one direction of friction lies along the capsule's axis. CORNER: a corner of a box; it
+counts only if it is below the box's centre. RIM: one of the four points on which a cylinder rests; `radius` is the number of
+the point. ELLIPSOID: the lowest point of an ellipsoid."""
 SPRING = 7
 """Number of parameters of a constraint's spring: stiffness [1/s^2], damping [1/s], least and greatest impedance, depth at
 which the impedance reaches its greatest value [m or rad], and midpoint and power of the impedance curve."""
@@ -45,11 +45,11 @@ class ContactPair:
 
 
 def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1) -> ContactPair:
-    """Return the parameters of contacts between two geoms. If `pair` is not -1, they are those of the model's explicit
-    contact pair with this index; otherwise they are combined from both geoms as in MuJoCo.
+    """Return the parameters of contacts between two geoms. If `pair` is not -1, the parameters are those of the
+    model's explicit contact pair with this index. Otherwise, the parameters are combined from both geoms by MuJoCo's rules.
 
-    Source: MuJoCo documentation, "Computation", contact parameters. mujoco-warp differs for shapes of different priority: it
-    takes the smaller solref if one of them is a stiffness.
+    Source: MuJoCo documentation, "Computation", contact parameters. mujoco-warp differs for shapes of different priority: if
+    the solref of either shape starts with a stiffness, mujoco-warp takes the elementwise minimum of both solrefs.
     """
     if pair >= 0:
         friction = np.maximum(model.pair_friction[pair], LEAST_FRICTION)
@@ -67,7 +67,8 @@ def contact_pair(model: mujoco.MjModel, first: int, second: int, pair: int = -1)
         share = float(mixes[0] / mixes.sum()) if mixes.min() >= TINY else float(mixes[0] >= TINY)
     weights = np.array([share, 1.0 - share])
     solref = model.geom_solref[both]
-    # The two solrefs are averaged if one shape has priority (weight 1), or if both are time constants.
+    # If one shape has the higher priority, its solref has weight 1. Otherwise, the two solrefs are averaged only if both
+    # start with a time constant.
     alike = priority[0] != priority[1] or (solref[:, 0] > 0.0).all()
     mixed = weights @ solref if alike else solref.min(axis=0)
     margin = float(model.geom_margin[both].sum())
@@ -105,8 +106,8 @@ def is_mixed(solref: np.ndarray) -> np.ndarray:
 
 
 def alike_springs(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> bool:
-    """Return True if no contact mixes two different solrefs of the model: in each pair of shapes, one shape has priority,
-    both have the same solref, or the pair is an explicit one.
+    """Return True if no contact combines two different solrefs of the model. This holds for a pair of shapes if one shape
+    has the higher priority, if both have the same solref, or if the pair is explicit.
     """
     for first, second, pair in pairs:
         solref, priority = model.geom_solref[[first, second]], model.geom_priority[[first, second]]
@@ -137,7 +138,7 @@ def kind_of(model: mujoco.MjModel, geom: int) -> str:
 
 
 def why_not(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> str:
-    """Return the reason why contacts of one of the `pairs` are not supported here, or an empty text."""
+    """Return the reason why the fused contact stage does not support one of the `pairs`, or an empty text."""
     for first, second, _ in pairs:
         kinds = [int(model.geom_type[g]) for g in (first, second)]
         on_plane = kinds[0] == KINDS.mjGEOM_PLANE and kinds[1] in ON_PLANES
@@ -149,7 +150,7 @@ def why_not(model: mujoco.MjModel, pairs: Sequence[tuple[int, int, int]]) -> str
 
 @dataclass(frozen=True)
 class PlanePoint:
-    """Point of a shape that may touch a plane."""
+    """A shape's point that may touch a plane. `touch` is the index of the `ContactPair` of shape and plane."""
 
     touch: int
     kind: int
@@ -160,7 +161,7 @@ class PlanePoint:
 
 
 def plane_points(model: mujoco.MjModel, touch: int, geom: int) -> Iterable[PlanePoint]:
-    """Yield the points of a geom that may touch a plane, in MuJoCo's order. `touch` is the index of their `ContactPair`."""
+    """Yield a geom's points that may touch a plane, in MuJoCo's order. `touch` is the index of their `ContactPair`."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == KINDS.mjGEOM_SPHERE:
         yield PlanePoint(touch, POINT, np.zeros(3), size[0])

@@ -1,4 +1,4 @@
-"""Height map on the device, and its contacts with spheres and capsules: Warp functions, geometry only.
+"""Height map on the device, and Warp functions that compute the geometry of its contacts with spheres and capsules.
 
 A shape consists of contact features (contact_features.py). For each feature only a few cells are checked: the surface of the
 cell below the feature, and the vertical faces and rims of the neighbouring cells.
@@ -120,7 +120,7 @@ def leave_sideways(ground: Ground, i: int, j: int, p: wp.vec3, top: Hit) -> Hit:
 @wp.func
 def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) -> Hit:
     """Return the possible contact of a point `p` over cell (i, j) with the neighbouring cell (ni, nj). The point may touch
-    the neighbour's vertical face, the rim of this face, or, without a face, the neighbour's surface.
+    the neighbour's vertical face, the rim of this face, or, if there is no face, the neighbour's surface.
     """
     x0 = ground.x + float(ni) * ground.cell
     y0 = ground.y + float(nj) * ground.cell
@@ -142,11 +142,11 @@ def hit_neighbour(ground: Ground, i: int, j: int, ni: int, nj: int, p: wp.vec3) 
             to = p - wp.vec3(qx, qy, wp.min(p[2], s[0]))
             hit.dist = wp.length(to)
             hit.normal = wp.normalize(to)
-            if hit.dist < 1e-6:  # the point lies on the face; push it to the side of the point's cell
+            if hit.dist < 1e-6:  # the point lies on the face; push it towards cell (i, j)
                 hit.normal = wp.normalize(wp.vec3(float(i - ni), float(j - nj), 0.0))
     elif s[0] > before - FACE:
-        # No face separates the two surfaces. The neighbour's surface counts only if the point's projection on its plane lies
-        # in the neighbour.
+        # No face separates the two surfaces. Take the neighbour's surface as a plane, and ignore it if the projection of the
+        # point on this plane lies outside the neighbour.
         plane = on_plane(p, wp.vec3(qx, qy, s[0]), s)
         x = p[0] - plane.dist * plane.normal[0]
         y = p[1] - plane.dist * plane.normal[1]
@@ -277,8 +277,8 @@ def around_point(ground: Ground, p: wp.vec3, near: float, faces_only: bool, hits
 
 @wp.func
 def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits, row: int) -> int:
-    """Find the possible contacts of a capsule a-b between its ends: for each half, the one with the nearest rim or ridge.
-    Write them to row `row` of `hits`, and return their number.
+    """For each half of a capsule a-b, find the possible contact with the nearest rim or ridge between the capsule's ends.
+    Write the contacts to row `row` of `hits`, and return their number.
     """
     middle = 0.5 * (a + b)
     cell = cell_of(ground, middle[0], middle[1])
@@ -311,7 +311,7 @@ def between_ends(ground: Ground, a: wp.vec3, b: wp.vec3, near: float, hits: Hits
 
 
 def room_for_hits(rows: int) -> Hits:
-    """Return memory for the contacts of `rows` features, on Warp's current device."""
+    """Return memory with `rows` rows for possible contacts, on Warp's current device."""
     hits = Hits()
     hits.dist = wp.zeros((rows, int(MOST)), dtype=float)
     hits.normal = wp.zeros((rows, int(MOST)), dtype=wp.vec3)
@@ -320,8 +320,8 @@ def room_for_hits(rows: int) -> Hits:
 
 
 def ground_of(height_map: HeightMap, largest: float, longest: float) -> Ground:
-    """Return `height_map` on Warp's current device. Features may have radii up to `largest` [m], and capsules lengths up to
-    `longest` [m].
+    """Return `height_map` on Warp's current device. `largest` is the largest radius of a feature plus the contact margin [m];
+    `longest` is the largest length of a capsule [m].
     """
     reach = int(np.ceil(largest / height_map.cell - 1e-9))
     wide = int(np.ceil((0.5 * longest + largest) / height_map.cell))

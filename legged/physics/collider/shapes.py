@@ -1,4 +1,4 @@
-"""Contacts of simple shapes with a plane and with each other: Warp functions, geometry only.
+"""Warp functions that compute the geometry of contacts of simple shapes with a plane and with each other.
 
 The results are those of C MuJoCo. mujoco-warp differs in two ways: it also keeps the corners of a box that lie above its
 centre, and it aligns friction with a capsule's axis only while the capsule is closer to horizontal than to vertical.
@@ -85,9 +85,9 @@ def on_plane(
 def round_shapes(
     first: wp.vec3, first_turn: wp.mat33, first_size: wp.vec2, second: wp.vec3, second_turn: wp.mat33, second_size: wp.vec2
 ) -> tuple[wp.vec2, mat23f, mat23f]:
-    """Return distances, positions and normals of the contacts between two capsules, whose sizes are (radius, half length); a
-    sphere is a capsule of half length 0. There are two contacts if the capsules are parallel, and one otherwise; the distance
-    of a missing contact is infinite.
+    """Return distances, positions and normals of the contacts between two capsules. A size is (radius, half length); a sphere
+    is a capsule of half length 0. There are two contacts if the capsules are parallel, and one otherwise. The distance of a
+    missing contact is infinite.
     """
     first_axis = wp.vec3(first_turn[0, 2], first_turn[1, 2], first_turn[2, 2])
     second_axis = wp.vec3(second_turn[0, 2], second_turn[1, 2], second_turn[2, 2])

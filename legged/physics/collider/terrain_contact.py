@@ -1,4 +1,4 @@
-"""Contacts of simple shapes with a height map, in one Warp kernel after mujoco-warp's own collisions.
+"""Contacts of simple shapes with a height map. One Warp kernel finds them, after mujoco-warp's own collision detection.
 
 mujoco-warp itself tests shapes against the triangular prisms of a height field with a general convex solver (GJK). That takes
 ten times as long, and vertical faces become ramps one cell wide. Here a contact needs only a few look-ups (ground.py).

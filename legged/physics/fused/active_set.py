@@ -21,12 +21,12 @@ ROW_STATES = {"UNKNOWN": UNKNOWN, "SLIPPING_BACK": SLIPPING_BACK, "SLIPPING": SL
 
 @dataclass(frozen=True)
 class ActiveSet:
-    """Row keys and row states of all worlds, on the device that is Warp's current one at construction."""
+    """Row keys and row states of all worlds, on the device that was Warp's current device at construction."""
 
     key: wp.array
-    """(N, rows) key that identifies a row across steps. Keys ascend; the first rows, of equality constraints, have none."""
+    """(N, rows) key that identifies a row across steps. Keys ascend. The first rows (equality constraints) have no keys."""
     last: wp.array
-    """(N, 1 + rows) number of rows in the last step, followed by their stored states in the same order."""
+    """(N, 1 + rows) number of rows with keys in the last step, followed by the stored states of these rows."""
 
     @classmethod
     def of(cls, d: Any) -> "ActiveSet":

@@ -62,14 +62,14 @@ def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
 
 
 class BlockStep:
-    """Makes complete steps of all worlds in mujoco-warp's data on a CPU."""
+    """Computes complete physics steps on a CPU, for all worlds of mujoco-warp's data."""
 
     def __init__(self, step: TorqueStep, contacts: ContactStage, threads: int) -> None:
         """Prepare to launch `step` and `contacts` on `threads` threads. `fits(step)` must be True."""
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
         solver = step.solver
-        moved = contacts.equalities  # `_before_blocks` has computed poses if there are equality constraints
+        moved = contacts.equalities  # with equality constraints, `_before_blocks` computes the poses
         self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, *solver.settings, solver.arrays, step.state]
         blocks = -(-step.worlds // WIDE)
         threads = min(threads, blocks)

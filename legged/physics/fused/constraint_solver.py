@@ -5,9 +5,9 @@ mujoco-warp needs about ten launches per iteration of the solver, and iterates u
 each world stops when it has converged. The objective is the same (Todorov, ICRA 2014; MuJoCo documentation, "Computation"):
 0.5 (a - a0)^T M (a - a0) + sum_r s_r(J_r a - aref_r) over accelerations a. For a limit or an edge of a friction pyramid, s_r
 is quadratic on the side on which the constraint exerts force; for dry friction it is Huber's function. The objective is
-piecewise quadratic. Newton's method with a line search ends when no row changes its state, the piece of its cost that
-applies. It starts with the states of the last step (active_set.py). They define a quadratic function whose minimum is usually
-near the solution.
+piecewise quadratic. A row's state tells which piece of the row's cost applies. Newton's method with a line search ends when
+no row changes its state. It starts with the states of the last step (active_set.py). These states define a quadratic function
+whose minimum is usually near the solution.
 """
 
 from typing import Any
@@ -26,8 +26,8 @@ SOURCE = ("constraint_rows.h", "elliptic_cones.h", "elimination.h", "constraint_
 ELLIPTIC_ROW = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC)
 MOST_ROWS = 512
 KEPT_BYTES = 3600
-"""Largest part of a Jacobian that a block keeps in shared memory [bytes]. All further rows are read from global memory, which
-lets more worlds run at once."""
+"""Largest part of a Jacobian that a block keeps in shared memory [bytes]. The block reads further rows from global memory.
+With this limit, more worlds fit on a multiprocessor."""
 MULTIPROCESSOR_BYTES, BYTES_OF_A_BLOCK = 228 * 1024, 1024
 """Shared memory of a multiprocessor of an H100, and the part of it that each block reserves [bytes]."""
 
@@ -49,7 +49,7 @@ def solver_constants(
     elliptic: bool = False,
     known: bool = False,
 ) -> dict[str, int | bool]:
-    """Return the constants of the native sources for models with one elimination tree.
+    """Return the constants of the native sources (SOURCE).
 
     Args:
         tree: elimination tree of the degrees of freedom.
@@ -59,7 +59,7 @@ def solver_constants(
         friction: True if there are rows of dry friction.
         dry: True if all rows of dry friction belong to degrees of freedom, and none to tendons.
         elliptic: True for elliptic friction cones.
-        known: True if rows have keys, with which the solver finds their states of the last step.
+        known: True if rows have keys. The solver uses a row's key to find the row's state in the last step.
     """
     nv = len(tree.parent)
     sizes = {"NV": nv, "ROWS": rows, "STRIDE": row_length(nv), "ENTRIES": entries}
@@ -125,8 +125,8 @@ class ConstraintSolver:
     ) -> None:
         """Prepare the launch for a `model` that `why_not` accepts; `m` and `d` are mujoco-warp's model and data for it. With
         `damped`, also compute the acceleration with implicitly integrated dampers. With `active_set`, start from the row
-        states of the last step; elliptic cones do not use it, since a sliding cone's cost is not quadratic. Warp's current
-        device must be that of `m` and `d`.
+        states of the last step; for elliptic cones, `active_set` is ignored, since a sliding cone's cost is not quadratic.
+        Warp's current device must be that of `m` and `d`.
         """
         tree, elliptic = Tree.of(model), m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
         friction = not m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS

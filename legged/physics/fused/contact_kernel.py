@@ -23,7 +23,8 @@ FLAGS, CONES = mujoco.mjtDisableBit, mujoco.mjtCone
 @wp.struct
 class StageArrays:
     """Arrays of the kernel: its own tables, and arrays of mujoco-warp's model and data. The kernel writes `contact_touch`,
-    `contact_mark`, `row_key` and all arrays after `equalities`. Arrays `touch_*` have one row for each `ContactPair`.
+    `contact_mark`, `row_key` and all arrays after `equalities`. The kernel writes `equalities` only if there are no equality
+    constraints. Arrays `touch_*` have one row for each `ContactPair`.
     """
 
     touch_geom: wp.array[wp.vec2i]
@@ -269,7 +270,7 @@ def stage_function(constants: dict[str, int | bool], planes: bool, pairs: bool, 
 
 
 def shared_bytes(constants: dict[str, int | bool]) -> int:
-    """Return the shared memory of a block [bytes] that contact_stage.h uses with a set of `stage_constants`."""
+    """Return the size of the shared memory that contact_stage.h uses in each block [bytes]."""
     return 112 * constants["SLOTS"] + 16 * constants["PLAIN"]
 
 
@@ -289,7 +290,7 @@ def stage_constants(
         model: MuJoCo's model.
         rows: largest number of constraint rows per world.
         slots: largest number of contacts per world.
-        dim: largest number of directions of a contact.
+        dim: largest number of directions in which a contact exerts force.
         frictions: True if there are rows of dry friction.
         limits: True if there are rows of joint limits.
         bounces: True if the springs of contacts differ between worlds.

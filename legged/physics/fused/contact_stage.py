@@ -5,7 +5,7 @@ them. Here each world has its own slots in mujoco-warp's contact arrays. Slots a
 from rows to contacts and from contacts to rows stay valid, so code that reads these arrays works unchanged.
 
 The lanes first test points of shapes against planes, pairs of spheres and capsules, and contact features against the height
-map. Then (contact_stage.h) they make the rows of dry friction, joint limits and contacts. mujoco-warp makes the rows of
+map. Then they make the rows of dry friction, joint limits and contacts (contact_stage.h). mujoco-warp makes the rows of
 equality constraints.
 """
 
@@ -38,7 +38,7 @@ FIXED = (
 )
 """Model arrays that are read once at construction, so they must not differ between worlds."""
 OWN_ARRAYS = ("jnt_limited", "contact_touch", "contact_mark", "row_key", "impratio_invsqrt", "dof_spring", "joint_spring")
-"""Arrays of the kernel, apart from `touch_*`, that are not arrays of mujoco-warp."""
+"""Arrays of the kernel, apart from `touch_*`, that are not taken by name from mujoco-warp's model or data."""
 FLAGS = mujoco.mjtDisableBit
 
 
@@ -82,7 +82,7 @@ class ContactStage:
         round_pairs = [k for k in range(len(pairs)) if not on_planes[k]]
 
         self.active_set = ActiveSet.of(d)
-        """Keys of the rows, and their states in the last step, which the solver finds by key."""
+        """Keys of the rows, and the states of the last step's rows. The solver finds a row's last state by the row's key."""
         self._arrays = self._stage_arrays(model, m, d)
         self._arrays.jnt_limited = wp.array(limited, dtype=int)
         items = self._candidates(model, d, points, round_pairs, [(met[p.geom], p) for p in features])

@@ -40,7 +40,7 @@ UNKNOWN = {
     "adhesion": ("geom_adhesion",),
     "delayed controls": ("actuator_delay",),
 }
-"""Unsupported feature -> arrays of the model. They contain only zeros if the model lacks the feature."""
+"""Unsupported feature -> arrays of the model that contain only zeros if the model lacks the feature."""
 COUNTED = {
     "nflex": "flexes",
     "nmocap": "mocap bodies",
@@ -53,7 +53,7 @@ NEEDED_STAGES = ("ACTUATION", "CLAMPCTRL", "DAMPER", "EULERDAMP", "GRAVITY", "SP
 PUSHED = "xfrc_applied"
 """Array of external forces. `randomized` contains this name if external forces act on bodies."""
 ROW_LENGTHS = {"OF_INERTIA": 11, "OF_MOTION": 7, "OF_BODY": 17}
-"""Lengths of rows in shared memory: of inertias, of motion axes, and of other quantities of bodies. They are odd, so that
+"""Lengths of rows in shared memory [floats]: of inertias, motion axes, and other quantities of bodies. They are odd, so that
 lanes that read different rows use different memory banks."""
 MOST_BLOCKS = 32
 """Number of blocks that a multiprocessor must be able to run at once. The compiler limits the registers of a lane
@@ -65,7 +65,7 @@ Vector10 = wp.types.vector(length=10, dtype=wp.float32)
 @wp.struct
 class DynamicsArrays:
     """Arrays of the kernel: its own tables, and arrays of mujoco-warp's model and data, which have the same names there. The
-    kernel writes those from `geom_xpos` on.
+    kernel writes `geom_xpos` and all arrays after it.
     """
 
     body_packed: wp.array[int]
@@ -168,7 +168,7 @@ def dynamics_constants(model: mujoco.MjModel, randomized: Collection[str] = ()) 
 
 
 def shared_bytes(model: mujoco.MjModel) -> int:
-    """Return the shared memory of a block [bytes] that smooth_dynamics.h uses."""
+    """Return the size of the shared memory that smooth_dynamics.h uses in each block [bytes]."""
     bodies, joints, dofs = model.nbody, model.njnt, model.nv
     place = max(7 * bodies + 6 * joints, ROW_LENGTHS["OF_BODY"] * bodies)
     return 4 * ((3 + ROW_LENGTHS["OF_INERTIA"]) * bodies + (1 + ROW_LENGTHS["OF_MOTION"]) * dofs + place)
@@ -187,7 +187,7 @@ def dynamics_kernel(constants: dict[str, int | bool]) -> Any:
 
 
 def dynamics_function(constants: dict[str, int | bool]) -> Any:
-    """Return the device function of the kernel, which computes one world."""
+    """Return the kernel's device function. It computes one world."""
 
     @wp.func_native(native_source(SOURCE, constants))
     def move_world(world: int, arrays: DynamicsArrays) -> None: ...
@@ -285,7 +285,7 @@ def _trees(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     For each body, `body_subtree` is the number of bodies in its subtree, itself included; `body_tree` is the index of its
     tree; `body_packed` packs its parent, its first joint, its number of joints and its level below the world into one
     integer. For each tree, `tree_root` is its first body, a child of the world. Trees without joints are left out, and
-    `body_tree` of their bodies is 0. `why_not` rejects models with more than 255 bodies or joints.
+    `body_tree` of their bodies is 0. Each index has 8 bits, so `why_not` rejects models with more than 255 bodies or joints.
     """
     parent = model.body_parentid
     level, subtree = np.zeros(model.nbody, dtype=int), np.ones(model.nbody, dtype=int)

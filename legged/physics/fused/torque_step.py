@@ -3,9 +3,9 @@
 mujoco-warp launches a stage for every feature that a model might have: gravity compensation, external forces, muscles with
 lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing, which
 adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` returns the first
-feature of a model that this step does not support. External forces on bodies (`xfrc_applied`) are applied if they were
-requested. The step ignores `qfrc_applied`. It does not compute sensors or cameras, and computes poses of bodies and sites
-only if equality constraints need them.
+feature of a model that this step does not support. The step applies external forces on bodies only if
+`TorqueStep(randomized=...)` contains their name, `xfrc_applied`. It ignores `qfrc_applied`. It does not compute sensors or
+cameras, and computes poses of bodies and sites only if equality constraints need them.
 """
 
 from collections.abc import Collection
@@ -37,7 +37,7 @@ def turned_by(quat: wp.vec4, rotation: wp.vec3) -> wp.vec4:
 
 @wp.struct
 class StateArrays:
-    """Arrays of mujoco-warp's model and data for the integration, which writes those from `qpos` on."""
+    """Arrays of mujoco-warp's model and data for the integration, which writes `qpos` and all arrays after it."""
 
     timestep: wp.array[float]
     jnt_type: wp.array[int]
@@ -87,8 +87,8 @@ def turn_joint(world: int, at: int, dof: int, h: float, of: StateArrays) -> None
 def integrate_joint(world: int, joint: int, of: StateArrays) -> None:
     """Integrate one joint by semi-implicit Euler. The call for joint 0 also sets the world's overflow flags.
 
-    All reads precede all writes, so that they wait for memory together: the compiler moves no read ahead of a write. For a
-    free joint this holds separately for its position and for its orientation.
+    All reads precede all writes, because the compiler moves no read ahead of a write. The reads then wait for memory
+    together. For a free joint, this order holds separately for the position and for the orientation.
     """
     h = of.timestep[world % of.timestep.shape[0]]
     at, dof = of.jnt_qposadr[joint], of.jnt_dofadr[joint]

@@ -9,8 +9,9 @@ import numpy as np
 CONNECT, WELD, JOINT = (int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in ("CONNECT", "WELD", "JOINT"))
 SITE = int(mujoco.mjtObj.mjOBJ_SITE)
 MOST_ROOT = 6
-"""Largest number of degrees of freedom in the root (`Tree.root`). Each lane holds one entry of the root's triangular matrix
-or right-hand side: with 6, these have 27 entries for 32 lanes. Every lane then solves for the root in its registers."""
+"""Largest number of degrees of freedom in the root (`Tree.root`). Each of the 32 lanes holds one entry of the root's
+triangular matrix or right-hand side, which have 27 entries together for 6 degrees of freedom. Every lane then solves for the
+root in its own registers."""
 MOST_DOFS = 60
 """Largest number of degrees of freedom for which mujoco-warp keeps dense Jacobian rows. The solver would allow 64, because a
 GPU lane can hold two degrees of freedom."""
@@ -81,9 +82,9 @@ class Tree:
         """Return the tables of elimination.h.
 
         For each degree of freedom, `dof_depth` is its depth, `dof_place` its place among those of the same depth, and `path`
-        its path as a bit mask. For each depth, `depth_width` is the number of degrees of freedom. For each depth and degree
-        of freedom, (depths * nv,), `dof_path` is the element of its path at that depth, and `below` the range of places of
-        its descendants at that depth: the first place in the lowest byte, the end in the next byte.
+        its path as a bit mask. For each depth, `depth_width` is the number of degrees of freedom. Two tables (depths * nv,)
+        have one number for each depth and degree of freedom. `dof_path` is the element of its path at that depth. `below` is
+        the range of places of its descendants at that depth: the first place in the lowest byte, the end in the next byte.
         """
         nv, depth = len(self.parent), self.depth
         paths = [self.path(i) for i in range(nv)]

@@ -1,4 +1,4 @@
-"""Constraint solver for a CPU that computes several worlds at once, one in each lane of its vector registers.
+"""Constraint solver for CPUs. It computes several worlds at once, one in each lane of the CPU's vector registers.
 
 For a single world the solver is a chain of short loops, which a compiler hardly vectorises. Worlds in different lanes execute
 the same instructions; worlds with fewer iterations or fewer rows wait for the others of their block. A world's results do not
@@ -17,16 +17,16 @@ from legged.physics.fused.tree import Tree
 
 SOURCE = ("wide_solver.h",)
 WIDE = 16
-"""Number of worlds per block: the number of floats in a register of AVX-512. Where registers are smaller, the compiler uses
-two or four of them."""
+"""Number of worlds per block: the number of floats in a register of AVX-512. If the CPU's registers are smaller, the compiler
+uses two or four registers instead of one."""
 STACK_BYTES = 2 * 1024 * 1024
-"""Largest size of a block's data on a thread's stack [bytes]; Linux gives a stack 8 MB."""
+"""Largest size of a block's data on a thread's stack [bytes]. By default, Linux gives a stack 8 MB."""
 
 
 def wide_constants(
     tree: Tree, entries: tuple[np.ndarray, np.ndarray], rows: int, damped: bool, friction: bool, known: bool = False
 ) -> dict[str, Constant]:
-    """Return the constants of wide_solver.h for models with one elimination tree.
+    """Return the constants of wide_solver.h.
 
     Args:
         tree: elimination tree of the degrees of freedom.
@@ -34,7 +34,7 @@ def wide_constants(
         rows: largest number of constraint rows.
         damped: True if dampers are integrated implicitly.
         friction: True if there are rows of dry friction.
-        known: True if rows have keys, with which the solver finds their states of the last step.
+        known: True if rows have keys. The solver uses a row's key to find the row's state in the last step.
     """
     nv = len(tree.parent)
     paths = [tree.path(i) for i in range(nv)]

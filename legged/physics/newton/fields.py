@@ -1,8 +1,7 @@
 """Randomisation in Newton's MuJoCo solver, by writing into the arrays of its internal mujoco-warp model.
 
-Newton's own arrays contain only friction and masses, and a captured step cannot notify the solver of changes. The solver's
-internal arrays have one row per world, under MuJoCo's names. Motors are not part of the solver: their torques are applied to
-joints.
+A captured step cannot notify the solver of changes in Newton's own arrays. The solver's internal arrays have one row per
+world, under MuJoCo's names. Motors are not part of the solver, which receives their torques as joint forces.
 """
 
 from collections.abc import Collection, Mapping
@@ -24,12 +23,12 @@ from legged.physics.warp.randomize_kernels import Redraws, Variants
 MOTORS = ("motor_strength", "actuator_gain", "torque_limit")
 """Fields of the motors, which convert controls to torques outside the solver."""
 CENTRES, BASE_CENTRE = "body_com", "base_com"
-"""Names here for Newton's own centres of mass, and for the base's centre of mass with which velocities are converted. Both
-must follow changes of the solver's `body_ipos`."""
+"""Names in this file for two arrays that must follow changes of the solver's `body_ipos`: the centres of mass of Newton's
+bodies, and the base's centre of mass that `NewtonStateIO` uses to convert velocities."""
 
 
 class _SolversScene(Scene):
-    """Scene of the solver's internal model, with its own order of shapes."""
+    """Scene of the solver's internal model, whose order of shapes differs from the robot's."""
 
     def __init__(self, name: str, solvers: mujoco.MjModel) -> None:
         self.name, self._solvers = name, solvers
@@ -47,8 +46,8 @@ class SolverFields:
     def __init__(
         self, scene: Scene, model: mujoco.MjModel, simulation: Simulation, base_com: Tensor, fields: Collection[str]
     ) -> None:
-        """Prepare to randomise `fields`. `model` is the robot's MuJoCo model. `base_com` (N, 3) is the base's centre of mass,
-        with which its velocities are converted. Warp's current device must be that of the simulation.
+        """Prepare to randomise `fields`. `model` is the robot's MuJoCo model. `base_com` (N, 3) is the base's centre of mass
+        that `NewtonStateIO` uses to convert velocities. Warp's current device must be that of the simulation.
         """
         solver: Any = simulation.solver
         self._m, self._d, worlds, device = solver.mjw_model, solver.mjw_data, len(base_com), base_com.device
@@ -94,7 +93,7 @@ class SolverFields:
             mjw.set_const(self._m, self._d)
 
     def _with_centres(self, made: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return `made`. If it contains the bodies' centres of mass, add the other arrays that hold them."""
+        """Return the arrays `made`. If `body_ipos` is among them, add the arrays `CENTRES` and `BASE_CENTRE`."""
         if "body_ipos" not in made:
             return dict(made)
         centres = made["body_ipos"]
@@ -108,7 +107,7 @@ class SolverFields:
                 self._redraws.append(Redraws(model, drawn, columns, {name: self._arrays[name] for name in names}))
 
     def redraw(self, mask: Tensor) -> None:
-        """Copy the current random values into the worlds of `mask` (N,)."""
+        """Apply the current random values to the model arrays of the worlds in `mask` (N,)."""
         for launch in self._redraws:
             launch.launch(mask)
 
@@ -120,6 +119,6 @@ class SolverFields:
             self._variants.replace(made)
 
     def choose(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy variant `chosen[i]` into world i, for each world in `mask`; both are (N,)."""
+        """Copy variant `chosen[i]` into each world i of `mask`. `mask` and `chosen` have the shape (N,)."""
         if self._variants is not None:
             self._variants.launch(mask, chosen)

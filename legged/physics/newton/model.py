@@ -18,7 +18,7 @@ from legged.terrain import Terrain
 
 @dataclass(frozen=True)
 class Layout:
-    """Indices within one world. Newton names bodies, joints and shapes by their path in the MJCF, and has its own order."""
+    """Counts and indices in one world. Newton names bodies, joints and shapes by MJCF path, and has its own order of them."""
 
     bodies: int
     coords: int
@@ -32,7 +32,7 @@ class Layout:
     """Index of the free joint's first coordinate. The joint has a position, then an orientation (x, y, z, w)."""
     root_qd: int
     """Index of the free joint's first velocity. The joint has the linear velocity of the base's centre of mass, then the
-    angular velocity, world frame."""
+    angular velocity, both in the world frame."""
     dof_q: np.ndarray
     """(D,) indices of the joints' coordinates, in the robot's order."""
     dof_qd: np.ndarray
@@ -72,13 +72,13 @@ def build_newton_model(
         ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
     """
     world = _builder(setup)
-    # Newton reads collision types from the MJCF.
+    # Newton reads collision types from the MJCF. `robot_source` returns an MJCF that contains them.
     source = robot_source(robot, sim.self_collisions)
     try:
         world.add_mjcf(source, enable_self_collisions=sim.self_collisions, parse_visuals=False, parse_sites=False)
     except ModuleNotFoundError as error:
-        needs = f"to read its meshes newton needs the package {error.name}, which is not installed here"
-        raise ConfigError(f"{robot.model_path}: {needs}: pip install {error.name}") from error
+        needs = f"newton needs the package {error.name} to read the robot's meshes, but it is not installed here"
+        raise ConfigError(f"{robot.model_path}: {needs}; run `pip install {error.name}`") from error
     for shape in range(world.shape_count):
         world.shape_gap[shape] = setup.gap
         if setup.springs is not None:
@@ -86,7 +86,7 @@ def build_newton_model(
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
-    # The ground is not part of a world: without self-collisions, shapes of the same world do not collide.
+    # Without self-collisions, shapes of the same world do not collide, so the ground is not part of a world.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs

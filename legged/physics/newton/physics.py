@@ -70,7 +70,7 @@ class NewtonPhysics(WarpPhysics):
         self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *launches))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
-        with wp.ScopedDevice(self._wp_device):  # restore the initial state after the trial launches
+        with wp.ScopedDevice(self._wp_device):  # set the initial state again, because the calls above may have changed it
             self.qpos.copy_(start)
             self.qvel.zero_()
             self._mask[:-1].fill_(True)

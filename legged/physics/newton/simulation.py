@@ -51,7 +51,7 @@ class Simulation:
                 self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
             )
         with warnings.catch_warnings():
-            # Newton warns if MuJoCo's version is not 3.17. Ignore this: the engine tests run with the installed version.
+            # Newton warns if MuJoCo's version is not 3.17. The warning is ignored, as tests run with the installed version.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
         if terrain is not None and uses_cell_collider(setup, sim):
@@ -85,7 +85,7 @@ class Simulation:
         TerrainContact(solver.mjw_model, solver.mjw_data, model, int(floor), terrain.height_map, shapes)
 
     def _request(self) -> SolverBase.Observables | None:
-        """Return the arrays that the solver fills in each step besides the state, or None without such arrays."""
+        """Return the arrays that each step of the solver writes besides the state, or None if there are no such arrays."""
         solver, kinds = self.solver, set()
         if self.setup.springs is None:
             kinds.add(solver.ObservableKind.CONTACT_F)

@@ -29,8 +29,8 @@ class SolverSetup:
     """Distance below which shapes become candidates for contact [m]."""
     springs: tuple[float, float, float] | None = None
     """Stiffness [N/m], damping [N s/m] and friction slope [N s/m] of contacts; None if the solver's contacts are not springs.
-    Unlike in MuJoCo, these are not scaled by masses. Solvers with springs do not report contact forces, so `springs.py`
-    computes them."""
+    Unlike in MuJoCo, these three numbers are not scaled by masses. Solvers with spring contacts do not report contact forces,
+    so `springs.py` computes the forces."""
     own_contacts: bool = False
     """True if the solver finds contacts itself, instead of using Newton's collision pipeline."""
     pipeline: dict[str, Any] = field(default_factory=dict)
@@ -42,13 +42,13 @@ class SolverSetup:
 
     @property
     def averages_friction(self) -> bool:
-        """True if the solver takes the mean of the two shapes' friction. MuJoCo takes the robot's, which has priority."""
+        """True if the solver averages the friction of two shapes in contact. MuJoCo uses that of the robot's shape."""
         return not self.own_contacts
 
     @property
     def friction_factor(self) -> float:
-        """Factor on the friction of the robot's shapes. It is 2 if the solver averages friction: the ground's friction is
-        then 0, and the mean is the robot's own friction. Friction between two shapes of the robot is doubled, too.
+        """Factor on the friction of the robot's shapes. It is 2 if the solver averages friction. The ground's friction is
+        then 0, so the mean is the robot's own friction. As a side effect, friction between two shapes of the robot doubles.
         """
         return 2.0 if self.averages_friction else 1.0
 
@@ -69,7 +69,7 @@ def _mujoco(model: newton.Model, sim: SimConfig) -> SolverMuJoCo:
         njmax=sim.njmax,
         kinematic_switchable_roots=False,  # otherwise every robot has a weld that is never used
     )
-    solver.mjw_model.opt.warn_overflow = 0  # `refresh` reports overflows; a warning would come from each thread
+    solver.mjw_model.opt.warn_overflow = 0  # instead of a warning from each thread, `refresh` reports overflows
     return solver
 
 
@@ -77,7 +77,7 @@ def _steel(model: newton.Model, sim: SimConfig) -> SolverSteel:
     return SolverSteel(
         model,
         enable_joint_limits=True,
-        joint_limit_activation_gap=0.1,  # [rad]; by default every joint limit takes a row in every step
+        joint_limit_activation_gap=0.1,  # [rad]; by default every joint limit takes a constraint row in every step
         articulation_constraint_max=sim.njmax,
         warn_constraint_overflow=False,  # `refresh` reports overflows
     )
@@ -85,7 +85,8 @@ def _steel(model: newton.Model, sim: SimConfig) -> SolverSteel:
 
 def _kamino(model: newton.Model, sim: SimConfig) -> SolverKamino:
     config = SolverKamino.Config(use_collision_detector=False)
-    # The default tolerances, a hundred times smaller, double the time and change the standing height by a micrometre.
+    # The default tolerances are a hundred times smaller. They double the computation time, but change the standing height
+    # by only a micrometre.
     config.padmm.primal_tolerance = config.padmm.dual_tolerance = config.padmm.compl_tolerance = 1e-4
     return SolverKamino(model, config)
 
@@ -100,7 +101,7 @@ SOLVERS = {
     "steel": SolverSetup(_steel, gap=0.01, register=SolverSteel.register_custom_attributes),
     "kamino": SolverSetup(_kamino, gap=0.01, register=SolverKamino.register_custom_attributes),
     # With 4 or 8 substeps the feet chatter and slide apart, and the robot collapses within two seconds. The mass matrix is
-    # computed once per physics step; in every substep, it would take nine tenths of the time.
+    # computed once per physics step, because its computation in every substep would take nine tenths of the time.
     "featherstone": SolverSetup(
         lambda model, sim: SolverFeatherstone(model, angular_damping=0.0, update_mass_matrix_interval=FEATHERSTONE_SUBSTEPS),
         substeps=FEATHERSTONE_SUBSTEPS,
@@ -114,10 +115,10 @@ SOLVERS = {
         springs=SPRINGS,
         maximal=True,
     ),
-    # Friction acts against slip within one substep only. Without contacts that remember where they began ("sticky"), the feet
-    # slide apart within a second for any number of substeps and iterations. With one substep the robot diverges. With 4
-    # substeps of 8 iterations instead of 8 substeps of 4, shapes that penetrate the ground bounce off it, and walking takes
-    # six times the power.
+    # Friction acts against slip within one substep only. Without "sticky" contacts, which remember where they began, the feet
+    # slide apart within a second, whatever the numbers of substeps and iterations. With one substep the simulation diverges.
+    # With 4 substeps of 8 iterations, instead of 8 substeps of 4 iterations, shapes that penetrate the ground bounce off it,
+    # and walking takes six times the power.
     "xpbd": SolverSetup(
         lambda model, sim: SolverXPBD(model, iterations=4),
         substeps=8,

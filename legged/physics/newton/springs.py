@@ -74,8 +74,8 @@ def launch_spring_forces(
     springs: tuple[float, float, float],
     force: wp.array,
 ) -> None:
-    """Write the force on the first shape of each contact, world frame [N], to `force`, for the body poses and velocities in
-    `state`. `springs` are stiffness [N/m], damping [N s/m] and friction slope [N s/m].
+    """Compute the force on the first shape of each contact from the body poses and velocities in `state`. Write it to
+    `force`, world frame [N]. `springs` are stiffness [N/m], damping [N s/m] and friction slope [N s/m].
     """
     wp.launch(
         spring_forces,

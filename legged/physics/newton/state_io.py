@@ -1,8 +1,8 @@
 """Conversion of states between Newton's conventions and the task's, and sums of contact forces on each shape.
 
-Newton's quaternions are (x, y, z, w). Its linear velocity is that of the body's centre of mass, and both its velocities are
-in the world frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear velocity is that of the
-base's origin in the world frame, and the angular velocity is in the base frame.
+Newton's quaternions are (x, y, z, w). Its linear velocity is that of the body's centre of mass. Its linear and
+angular velocities are in the world frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear
+velocity is that of the base's origin in the world frame, and the angular velocity is in the base frame.
 """
 
 from typing import Any
@@ -115,8 +115,8 @@ def add_shape_forces(
     world_of_shape: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """Add the force of each contact to its first shape, and the reaction to its second, world frame [N]. One thread per
-    contact.
+    """Add each contact's force to the sum of its first shape, and the opposite force to the sum of its second shape, world
+    frame [N]. One thread per contact.
     """
     i = wp.tid()
     if i >= count[0]:
@@ -148,7 +148,7 @@ def take_flags(flags: wp.array[Any], lost: int, overflow: wp.array[int]):
 
 
 class NewtonStateIO(RobotStateIO):
-    """Launches of the kernels above on the fixed arrays of a simulation and of the task."""
+    """Launches the kernels above, on arrays of a simulation and of the task. All arrays keep their addresses."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class NewtonStateIO(RobotStateIO):
         self._qpos, self._qvel, self._torques = task
         count, layout = len(overflowed), simulation.layout
         self._overflow = wp.zeros(count, dtype=int)
-        nothing = wp.zeros((count, 0), dtype=float)  # the solver clears its warm start itself
+        nothing = wp.zeros((count, 0), dtype=float)  # there are no activations, and the solver clears its warm start itself
         arrays = EngineArrays(*task, nothing, nothing, self._overflow, lost=1)
         super().__init__(arrays, overflowed, model, robot, state)
         self._simulation = simulation
@@ -190,7 +190,7 @@ class NewtonStateIO(RobotStateIO):
         self._tracked = wp.array(tracked, dtype=int)
 
     def apply_torques(self) -> None:
-        """Write the generalised forces of the joints from the task's controls."""
+        """Convert the task's controls to generalised forces of Newton's joints."""
         if self.motors is not None and self.motors.motors:
             varied = [wp.from_torch(self.motors.gains), wp.from_torch(self.motors.limits)]
             inputs = [self._torques, *varied, self._dof_qd]
@@ -209,8 +209,8 @@ class NewtonStateIO(RobotStateIO):
         wp.launch(put_states, dim=len(self._qpos), inputs=inputs, outputs=[self._joint_q, self._joint_qd])
 
     def note_lost_contacts(self) -> None:
-        """Record, until the next refresh, which worlds may have lost contacts in this step: all worlds if the pool of
-        contacts was full, and those whose flags the solver has set. Clear the solver's flags.
+        """Set `_overflow` for the worlds that may have lost contacts in this step. If the pool of contacts has overflowed,
+        these are all worlds, otherwise those that the solver has flagged. Clear the solver's flags.
         """
         simulation, contacts = self._simulation, self._simulation.contacts
         inputs = [contacts.rigid_contact_count, contacts.rigid_contact_max]

@@ -18,9 +18,9 @@ ROBOT, GROUND = 1, 2
 
 
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
-    """Return the robot without a ground. Some settings replace those of its file: its shapes collide with the ground, and,
-    with `self_collisions`, with each other unless their bodies are neighbours. Contacts with the ground use the friction of
-    the robot's shapes, because it can be randomised. Joints have the rotor inertias of `robot`.
+    """Return the robot without a ground. Some settings replace those of its file. Its shapes collide with the ground. With
+    `self_collisions`, they also collide with each other unless their bodies are neighbours. Contacts with the ground use the
+    friction of the robot's shapes, because this friction can be randomised. Joints have the rotor inertias of `robot`.
     """
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):
@@ -63,7 +63,7 @@ def _settings(spec: mujoco.MjSpec, robot: Robot) -> tuple[dict[str, tuple[int, i
 
 
 def contact_sensor_columns(model: mujoco.MjModel, robot: Robot) -> tuple[int, int]:
-    """Return the contact sensors' first column in sensordata, and the one after their last. Each shape has 3 columns."""
+    """Return the first column of the contact sensors in sensordata, and the column after the last. A shape has 3 columns."""
     start = int(model.sensor(f"contact_{robot.shape_names[0]}").adr[0])
     return start, start + 3 * len(robot.shape_names)
 

@@ -11,9 +11,9 @@ from legged.terrain.height_map import CORNERS, HeightMap
 from legged.terrain.terrain import Terrain
 
 DEPTH = 20.0
-"""Distance from the lowest point of the map to the bottom of all geoms [m]. It is so large that nothing slips between two
-geoms. Points of a height field that no slope uses lie at the bottom. The flanks that lead down to them are nearly vertical:
-they deviate by less than 1 mm for each 0.2 m of height."""
+"""Distance from the lowest point of the map to the bottom of all geoms [m]. Geoms are so deep that nothing slips between two
+of them. Points of a height field that no slope uses lie at the bottom. The flanks that lead down to these points deviate from
+the vertical by less than 1 mm for each 0.2 m of height."""
 SKIN = 0.05
 """Distance of a colliding height field below the ground, along the ground's normal [m]. The geom has a margin of this size,
 so that shapes collide with it at the height of the ground.
@@ -39,7 +39,7 @@ def add_terrain(
     Return the geoms, which are named terrain_<number>.
 
     The surface is that of the height map, except that a twisted cell becomes two triangles instead of a bilinear patch.
-    Shapes collide with a height field at the distance `SKIN` above its geom, and edges are rounded with this radius.
+    Shapes collide with a height field at the distance `SKIN` above its geom, so its edges are rounded with this radius.
 
     Args:
         spec: model that the geoms are added to.
@@ -105,7 +105,7 @@ class _Geoms:
     """Height of the bottom of all geoms [m]."""
     attributes: dict[str, Any]
     skin: float = 0.0
-    """Distance above a height field's geom at which it collides [m]."""
+    """Distance above a height field's geom at which shapes collide with it [m]."""
     overlap: bool = False
     """True if boxes of equal height overlap, so that level ground has few seams."""
     added: list[mujoco.MjsGeom] = field(default_factory=list)
@@ -116,8 +116,8 @@ class _Geoms:
         self._add(x.start, y.start, half, top - half[2], type=mujoco.mjtGeom.mjGEOM_BOX, size=half)
 
     def surface(self, x: int, y: int, heights: np.ndarray, skin: float = 0.0) -> None:
-        """Add a height field with points `heights` (X + 1, Y + 1) [m], which collides at a distance of `skin` [m]. The first
-        point lies at the outer corner of cell (x, y).
+        """Add a height field with the points `heights` (X + 1, Y + 1) [m]. Shapes collide with it at the distance `skin` [m]
+        above its geom. The first point lies at the corner of cell (x, y) with the lowest x and y.
         """
         half = [0.5 * (n - 1) * self.ground.cell for n in heights.shape]
         low, high = float(heights.min()), float(heights.max())
@@ -144,7 +144,7 @@ class _Geoms:
 
 
 def _attributes(material: str | None, collide: bool) -> dict[str, Any]:
-    """Return the attributes of a terrain's geoms. With `collide`, these collide with the robot, but not with each other."""
+    """Return the attributes of a terrain's geoms. With `collide`, the geoms collide with the robot only."""
     bits = {"contype": 2, "conaffinity": 1} if collide else {"contype": 0, "conaffinity": 0}
     return {**bits, "group": 0} | ({"material": material} if material else {})
 
@@ -183,13 +183,13 @@ def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
     agree in the points that they share, and the field does not stick out above any other cell.
 
     The first set leaves out all cells around two kinds of points. At the first kind, sloped cells differ in height. The
-    second kind lies above a corner of another cell, of which the field would contain at least three corners, for example
-    because slopes surround the cell. The cells that are left out are distributed over further sets. Between two cells of such
-    a set lie at least two other cells.
+    second kind lies above a corner of a cell that is not sloped, if the field would use at least three corners of this cell,
+    for example because slopes surround it. The cells that are left out are distributed over further sets. Between two cells
+    of such a set lie at least two other cells.
     """
     points, bad = _lattice(corners, sloped)
     used = [~np.isnan(own) for own in _at_corners(points)]
-    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # any three corners include two opposite ones
+    covers = ~sloped & ((used[0] & used[3]) | (used[1] & used[2]))  # three corners of a cell include two opposite ones
     for k, (top, is_bad) in enumerate(zip(_at_corners(points), _at_corners(bad), strict=True)):
         is_bad |= covers & (top > corners[:, :, k] + SAME)
     alone = sloped & np.any(_at_corners(bad), axis=0)
@@ -237,9 +237,9 @@ def _rectangles(low: np.ndarray, flat: np.ndarray, overlap: bool) -> Iterator[tu
     """Yield rectangles of cells, and their heights [m]. They cover all `flat` cells (X, Y), whose heights are `low` [m].
 
     Boxes are solid, so a box may extend below higher cells: a pyramid becomes a stack of plates. Boxes that are only rendered
-    do not overlap. Boxes that collide overlap those of equal height (`overlap`), because at a seam between boxes, a foot that
-    sinks in would be pushed sideways into the next box. The method is greedy: the lowest cell that is still uncovered takes
-    the larger of two rectangles. One of them is extended along x first, the other along y first.
+    do not overlap. Boxes that collide overlap those of equal height (`overlap`), so that level ground has few seams. At a
+    seam, a foot that sinks in would be pushed sideways into the next box. The method is greedy: the lowest cell that is still
+    uncovered takes the larger of two rectangles. One of them is extended along x first, the other along y first.
     """
     open_cells = flat.copy()
     while open_cells.any():

@@ -1,11 +1,11 @@
-"""Compilation of a model's Warp kernels before their first launch: all modules that the cache lacks, on all CPU cores.
+"""Parallel compilation of a model's Warp kernels before their first launch, if the cache lacks them.
 
 By itself, Warp compiles a module when one of its kernels is first launched, so modules are compiled one after the other. Here
 a dry run records launches instead of making them, which yields the modules that a model needs. Forked processes then compile
 the missing modules into Warp's cache. Threads would not help: within one process NVRTC compiles one program at a time. A lock
 lets one process compile while others, such as further ranks of a multi-GPU training, wait for its results.
 
-This only saves time: Warp compiles a module that is still missing when it is launched.
+All this only saves time. If a module is still missing when one of its kernels is launched, Warp compiles it then.
 """
 
 import gc
@@ -29,10 +29,10 @@ from filelock import lock_descriptor, unlock_descriptor
 POLL_S = 0.1
 PLAIN_LINES_EVERY_S = 5.0
 STALLED_S = 300.0
-"""Compiling processes are ended if they finish no module for this time [s]."""
+"""The forked processes are ended if none of them finishes a module for this time [s]."""
 MOST_PROCESSES = 16
 TILED_COSTS = 20
-"""Compiling a tiled kernel takes as long as this many ordinary kernels: it may need CUDA's linear algebra."""
+"""Number of ordinary kernels that take as long to compile as a tiled kernel, which may need CUDA's linear algebra."""
 CUDA_BLOCK_DIM, CPU_BLOCK_DIM = 256, 1
 """Numbers of threads per block that Warp uses by default. Warp compiles a module separately for each block size."""
 
@@ -88,7 +88,7 @@ def launched(device: Any, functions: Iterable[Callable[[], object]]) -> list[Bui
 
     def note(kernel: Any, dim: Any = 0, *_: Any, block_dim: int | None = None, tiled: bool = False, **__: Any) -> None:
         if kernel.is_generic or math.prod(dim if isinstance(dim, list | tuple) else (dim,)) == 0:
-            return  # Warp compiles an instance of a generic kernel for the argument types, which is not known here
+            return  # a generic kernel is compiled for the types of its arguments, which are not known here
         size = CPU_BLOCK_DIM if device.is_cpu else block_dim or CUDA_BLOCK_DIM
         found[Build(kernel.module, size)] = TILED_COSTS * tiled + len(kernel.module.kernels)
 
@@ -163,7 +163,7 @@ def _fork(work: int, builds: list[Build], device: Any, scratch: str) -> int:
         while (item := os.read(work, 2)) and os.getppid() == parent:
             builds[struct.unpack("=H", item)[0]].compile(device)
     finally:
-        os._exit(0)  # skip the parent's clean-up; an error occurs again when Warp compiles the module itself
+        os._exit(0)  # skip the parent's clean-up. Warp itself compiles the module again later, and reports any error.
 
 
 class _Lock:
@@ -178,14 +178,14 @@ class _Lock:
 
     def __exit__(self, *_: object) -> None:
         with suppress(OSError):
-            unlock_descriptor(self._file.fileno())  # a close would keep the lock while a child has the file open
+            unlock_descriptor(self._file.fileno())  # `close` alone would not release the lock while a child has the file open
         self._file.close()
 
     def acquire(self) -> bool:
         """Take the lock if it is free, without waiting. Return True if this process has it."""
         try:
             return lock_descriptor(self._file.fileno(), blocking=False)
-        except OSError:  # a file system without locks; compiling twice does no harm
+        except OSError:  # the file system has no locks, and compiling twice does no harm
             return True
 
 

@@ -16,8 +16,8 @@ def add_contact_forces(
     contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """Add the force of each contact to its second shape, and the reaction to its first, world frame [N]. One thread per
-    contact.
+    """Add each contact's force to the sum of its second shape, and the opposite force to the sum of its first shape, world
+    frame [N]. One thread per contact.
     """
     i = wp.tid()
     if i >= nacon[0]:
@@ -35,13 +35,13 @@ ON_GPU = "#if defined(__CUDA_ARCH__)\nreturn {};\n#else\nreturn {};\n#endif\n"
 
 @wp.func_native(ON_GPU.format("__shfl_sync(0xffffffffu, x, lane)", "x"))
 def from_lane(x: float, lane: int) -> float:  # type: ignore[empty-body]
-    """Return the value of `x` in another lane of this warp. On the CPU there is one lane."""
+    """Return the value of `x` in lane `lane` of this warp. On the CPU there is one lane."""
     ...
 
 
 @wp.func_native(ON_GPU.format("__shfl_sync(0xffffffffu, x, lane)", "x"))
 def whole_from_lane(x: int, lane: int) -> int:  # type: ignore[empty-body]
-    """Return the integer `x` of another lane of this warp. On the CPU there is one lane."""
+    """Return the integer `x` in lane `lane` of this warp. On the CPU there is one lane."""
     ...
 
 
@@ -66,11 +66,11 @@ def sum_contact_forces(
     contact_of_geom: wp.array[int],
     contact_forces: wp.array2d[wp.vec3],
 ):
-    """Sum the contact forces on each shape in one launch, for worlds with `slots` contacts each. `lanes` threads per world:
-    each computes the force of one contact, and then the sum on one shape.
+    """Sum the contact forces on each shape in one launch, for worlds with room for `slots` contacts each. `lanes` threads per
+    world. Each thread computes the force of one contact, and then the sum on one shape.
 
-    With elliptic cones, rows hold the force along the axes of the contact frame. With pyramids, they hold the forces along
-    the edges, each of which is the normal plus or minus friction times a tangent.
+    With elliptic cones, constraint rows hold the force along the axes of the contact frame. With pyramids, they hold the
+    forces along the edges, each of which is the normal plus or minus friction times a tangent.
     """
     world, lane = wp.tid()
     shapes = contact_forces.shape[1]

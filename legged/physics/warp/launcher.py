@@ -38,14 +38,14 @@ class Launcher:
             inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
             wp.launch(kernel, dim=dim, inputs=inputs)
             if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                # The table is only full if each step creates new tensors. Its launches are then useless, and are dropped.
+                # The table fills up only if each step creates new tensors. Its launches are then useless, and are dropped.
                 if len(self._prepared) >= MOST_PREPARED:
                     self._prepared.clear()
                 self._prepared[key] = prepared
 
 
 def _identity(argument: Tensor | float) -> Any:
-    """Return a number itself, and for a tensor the properties that a recorded launch depends on."""
+    """Return a number unchanged. For a tensor, return the properties that a recorded launch depends on."""
     if isinstance(argument, Tensor):
         return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
     return argument

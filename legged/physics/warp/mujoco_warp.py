@@ -1,4 +1,4 @@
-"""Batched MuJoCo on a GPU by mujoco-warp, or on Warp's CPU device."""
+"""Batched MuJoCo by mujoco-warp, on a GPU or on Warp's CPU device."""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -104,7 +104,7 @@ class MujocoWarpPhysics(WarpPhysics):
         if sim.step != "library":
             ask_for_dense_rows(self.model)
         for solrefs in (self.model.eq_solref, self.model.jnt_solref, self.model.dof_solref):
-            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # C MuJoCo does this in each step, mujoco-warp does not
+            solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # unlike C MuJoCo, mujoco-warp does not replace mixed solrefs
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
         self._redraws: Redraws | None = None
@@ -113,7 +113,7 @@ class MujocoWarpPhysics(WarpPhysics):
         """Names of the model arrays with one row per world."""
         with wp.ScopedDevice(self._wp_device):
             self._m = self._put_model(scene.name)
-            self._m.opt.warn_overflow = 0  # `refresh` reports overflows; a warning would come from each thread
+            self._m.opt.warn_overflow = 0  # instead of a warning from each thread, `refresh` reports overflows
             self._d = mjw.make_data(self.model, nworld=num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
             self._on_cells: TerrainContact | None = None
             if terrain is not None and cells:
@@ -236,7 +236,7 @@ class MujocoWarpPhysics(WarpPhysics):
         no_solver = ConstraintSolver.why_not(self._m, self._d)
         self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
         if step == "fused" and self.why_library:
-            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses the parts that support the model")
+            raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses fused parts that support the model")
         if no_solver:
             return
         self._m.opt.run_qacc_smooth = False  # the fused solver does not use `qacc_smooth`
@@ -290,7 +290,7 @@ class MujocoWarpPhysics(WarpPhysics):
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        # A state without "last_rows" comes from a version whose solver did not keep the active set.
+        # A state without "last_rows" comes from an older version of legged, whose solver did not keep the active set.
         if self._contacts is not None and "last_rows" not in saved:
             saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.active_set.last))}
         super().load_state(saved)

@@ -72,9 +72,9 @@ def run_lstm(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """Run the LSTM. One thread per robot and joint. `weights` holds, for each layer, the weights of inputs (4 out, in), those
-    of hidden units (4 out, out) and biases, for the gates i, f, g, o. Hidden states are the even rows of `state`, cell states
-    the odd.
+    """Run the LSTM. One thread per robot and joint. For each layer, `weights` holds the weights of inputs (4 out, in), the
+    weights of hidden units (4 out, out), and the biases (4 out,), each in the order of the gates i, f, g, o. Even rows of
+    `state` hold hidden states, odd rows hold cell states.
     """
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint

@@ -46,8 +46,8 @@ class WarpPhysics(Physics):
         """Launch one physics step."""
 
     def _record_step(self) -> Callable[[], Any]:
-        """Return a function that replays the step as a Warp graph on the CPU: the same arithmetic without the cost of
-        launching from Python. The step runs once before the recording, which compiles its kernels.
+        """Return a function that replays the step as a Warp graph on the CPU, with the same arithmetic but without the cost
+        of launches from Python. The step runs once before the recording, so that its kernels are compiled.
         """
         with wp.ScopedDevice(self._wp_device):
             self._step()
@@ -77,7 +77,7 @@ class WarpPhysics(Physics):
 
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
-        if not forces_read:  # on a second call, this would undo the clearing of forces by `write`
+        if not forces_read:  # without a new step, a second read would restore the forces that `write` has cleared
             with self._forces_stream.fork(), self._on_device():
                 self._state_io.contact_forces()
         with self._on_device():

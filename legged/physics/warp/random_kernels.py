@@ -22,8 +22,8 @@ def find_moments(
     chosen: wp.array[wp.int64],
     chosen_due: wp.array[wp.bool],
 ):
-    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` is never true, column 1 is true at
-    a reset, and the others at the ends of intervals. A robot gets another model variant if column `chosen_at` is true.
+    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` is never true. Column 1 is true at
+    a reset, each further column at the end of an interval. If column `chosen_at` is true, the model variant changes.
     """
     robot = wp.tid()
     something = wp.bool(reset[robot])
@@ -125,7 +125,7 @@ def vary_control(
     damping, torque limit and default angle of each joint.
     """
     robot, joint = wp.tid()
-    # All reads precede all writes, so that they wait for memory together: the compiler moves no read ahead of a write.
+    # All reads precede all writes, so that reads wait for memory together. The compiler moves no read ahead of a write.
     p = nominal[0, joint] * p_gain[robot, joint]
     d = nominal[1, joint] * d_gain[robot, joint]
     most = nominal[2, joint] * torque_limit[robot, joint]
@@ -152,9 +152,9 @@ def disturb(
     velocity: wp.array2d[float],
     total: wp.array3d[float],
 ):
-    """Update kicks and external forces. One thread per robot and body; the thread of body 0, the world, updates the kicks.
-    `drawn` holds seven numbers per kick (six of the velocity, then the interval), then five per push (three of the force, the
-    interval, the duration).
+    """Update kicks and external forces. One thread per robot and body. The thread of body 0 (the world) updates the kicks.
+    `drawn` first holds seven numbers per kick: six of the velocity, and the interval. Then it holds five numbers per push:
+    three of the force, the interval, and the duration.
     """
     robot, body = wp.tid()
     goes_on = wp.bool(mask[robot])

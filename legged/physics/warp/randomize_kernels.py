@@ -16,7 +16,7 @@ BOUNCE = {"": 0, "ratio": 1, "inverse": 2}
 ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.constant(BOUNCE["inverse"])
 THREADS = 128
 """Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. With one thread for each
-number and world, most threads would be idle. A single warp would take about ten rounds, and wait for memory in each."""
+number and world, most threads would be idle. With 32, each thread would wait for memory about ten times."""
 MOST_ARRAYS = 14
 """Largest number of arrays that one launch writes. All fields together need fewer."""
 
@@ -91,8 +91,8 @@ def write_drawn(
 ):
     """Compute the randomised numbers of the worlds in `mask`: each is the model's own number, to which the changes of all
     fields are applied in turn. `threads` threads per world share the numbers. `place` holds the array of each number and its
-    position there. `entry` holds, for each change, the column of the value, the operation, and the conversion from
-    restitution.
+    position there. `entry` holds, for each change, the column of its value in `drawn`, the operation, and the conversion
+    from restitution.
     """
     world, thread = wp.tid()
     if not mask[world]:
@@ -156,7 +156,7 @@ def _arrays(arrays: Sequence[Tensor]) -> Any:
 
 
 class Redraws:
-    """Launch that applies the random values in `drawn` to arrays of the model."""
+    """Applies random values to arrays of the model, in one launch."""
 
     def __init__(
         self, of: RandomizedModel, drawn: Tensor, columns: Mapping[str, slice], arrays: Mapping[str, Tensor]
@@ -226,6 +226,6 @@ class Variants:
         self._variants.copy_(self._side_by_side(made))
 
     def launch(self, mask: Tensor, chosen: Tensor) -> None:
-        """Copy variant `chosen[i]` into world i, for each world in `mask`; both are (N,)."""
+        """Copy variant `chosen[i]` into each world i of `mask`. `mask` and `chosen` have the shape (N,)."""
         inputs = [self._dim[1], wp.from_torch(mask), wp.from_torch(chosen), *self._inputs]
         wp.launch(copy_variants, dim=self._dim, inputs=inputs)

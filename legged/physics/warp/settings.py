@@ -1,4 +1,4 @@
-"""Settings of Warp, which every package with kernels imports first."""
+"""Settings of Warp. Every package with kernels imports this module first."""
 
 import warp as wp
 

@@ -1,7 +1,7 @@
 """Kernels that copy states, kinematics and contact forces between an engine's arrays and those of the task.
 
-The same formulas in torch (mujoco.py, feet.py) take about 140 launches per control step, a third of its time with 4096
-robots.
+In torch (mujoco.py, feet.py), the same formulas take about 140 launches per control step. With 4096 robots, these launches
+take a third of the step's time.
 """
 
 from abc import ABC, abstractmethod
@@ -19,7 +19,7 @@ from legged.physics.robot_state import RobotState
 from legged.physics.warp.contact_forces import add_contact_forces, sum_contact_forces
 from legged.robots.robot import Robot
 
-# Flags of dropped contacts or constraint rows. The other bits (iteration limits) do not mean a loss.
+# Overflow flags of dropped contacts or constraint rows. All other flags, such as iteration limits, are ignored.
 LOST = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
 
 
@@ -66,7 +66,7 @@ def read_kinematics(
     overflowed: wp.array[wp.bool],
 ):
     """Compute the base's velocity and gravity in the base frame, the feet's positions and velocities, and the overflow flags.
-    One thread per world and foot. Tables are (levels, feet), from the foot up to the base.
+    One thread per world and foot. `position` to `body_quat` are the fields of `FootChains`, (levels, feet) each.
     """
     world, foot = wp.tid()
     base = wp.vec3(qpos[world, 0], qpos[world, 1], qpos[world, 2])
@@ -144,7 +144,7 @@ def add_velocities(mask: wp.array[wp.bool], delta: wp.array2d[float], qvel: wp.a
 
 @dataclass(frozen=True)
 class EngineArrays:
-    """Arrays of an engine that the kernels write or read, (N, ...) each; `qpos` and `qvel` are in MuJoCo's layout."""
+    """Arrays (N, ...) of an engine. The kernels read or write them. `qpos` and `qvel` are in MuJoCo's layout."""
 
     qpos: wp.array
     qvel: wp.array
@@ -160,11 +160,11 @@ class EngineArrays:
 
 
 class StateIO:
-    """Launches of the kernels that write states and read kinematics, on fixed arrays, so that a graph can capture them."""
+    """Launches kernels that write states and read kinematics. Arrays are fixed, so that a graph can capture the launches."""
 
     def __init__(self, arrays: EngineArrays, overflowed: torch.Tensor) -> None:
-        """Prepare for a model without a robot: only `overflowed` (N,) is read. Warp's current device must be that of the
-        arrays.
+        """Prepare for a model without a robot: `kinematics` then sets only `overflowed` (N,). Warp's current device must be
+        that of the arrays.
         """
         self._arrays = arrays
         self._overflowed = wp.from_torch(overflowed)
@@ -187,7 +187,7 @@ class StateIO:
         wp.launch(add_velocities, dim=tuple(delta.shape), inputs=inputs)
 
     def kinematics(self) -> None:
-        """Read all outputs except forces, and clear the overflow flags."""
+        """Read the overflow flags and, for a robot, its kinematics. Then clear the overflow flags."""
         inputs = [self._arrays.overflow, self._arrays.lost]
         wp.launch(read_flags, dim=len(self._overflowed), inputs=inputs, outputs=[self._overflowed])
 
@@ -196,7 +196,7 @@ class StateIO:
 
 
 class RobotStateIO(StateIO, ABC):
-    """Launches of the kernels for a robot with a floating base and feet."""
+    """StateIO of a model with a robot that has a floating base and feet."""
 
     def __init__(
         self, arrays: EngineArrays, overflowed: torch.Tensor, model: mujoco.MjModel, robot: Robot, state: RobotState
@@ -233,7 +233,7 @@ class RobotStateIO(StateIO, ABC):
 
 
 class MujocoWarpStateIO(RobotStateIO):
-    """Launches of the kernels for a robot in mujoco-warp, including contact forces."""
+    """StateIO of a robot in mujoco-warp. It also reads the contact forces."""
 
     def __init__(
         self,
@@ -279,5 +279,5 @@ class MujocoWarpStateIO(RobotStateIO):
 
 
 def arrays_of(d: Any) -> EngineArrays:
-    """Return the arrays of mujoco-warp's data that the kernels write or read."""
+    """Return those arrays of mujoco-warp's data `d` that the kernels read or write."""
     return EngineArrays(d.qpos, d.qvel, d.ctrl, d.act, d.qacc_warmstart, d.overflow, LOST)

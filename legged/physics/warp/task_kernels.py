@@ -1,6 +1,6 @@
 """Kernels for the parts of a task that have a fixed formula. Each kernel replaces 6 to 20 torch operations by one launch.
 
-The C engine runs the same formulas in torch, in `legged/mdp/`; a test checks that both are bit-identical.
+With the C engine, the same formulas run in torch (`legged/mdp/`). A test checks that kernels and torch give identical bits.
 """
 
 import torch
@@ -33,7 +33,7 @@ def hold_joints(
     limit: wp.array2d[float],
     torques: wp.array2d[float],
 ):
-    """Compute the torques of PD control. One thread per robot and joint. NaN stays NaN."""
+    """Compute the torques of PD control, clipped at `limit`. One thread per robot and joint. Torques of NaN stay NaN."""
     robot, joint = wp.tid()
     spring = stiffness[robot, joint] * (target[robot, joint] - dof_pos[robot, joint])
     torque = spring - damping[robot, joint] * dof_vel[robot, joint]
@@ -145,8 +145,8 @@ def follow_commands(
     share: wp.array[float],
     reached: wp.array3d[float],
 ):
-    """For each command above half of its current limit, compute its size and the velocity in its direction; for all others,
-    zeros. One thread per robot and axis.
+    """Write the velocity in the direction of each command, and the command's size. Write zeros if the command is at most half
+    of its current limit, or if the robot is not `valid`. One thread per robot and axis.
     """
     robot, axis = wp.tid()
     command = commands[robot, axis]
@@ -276,9 +276,9 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """Add up the rewards of all terms. One thread per robot; each row of an array belongs to a term. Terms are processed in
-    groups of four, so that all reads of a group precede its writes and wait for memory together: the compiler moves no read
-    ahead of a write.
+    """Add up the rewards of all terms. One thread per robot; each row of an array belongs to a term. The compiler moves no
+    read ahead of a write. So terms are processed in groups of four: all reads of a group come first, and wait for memory
+    together.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -308,10 +308,10 @@ def add_rewards(
 
 
 class TaskKernels(Launcher):
-    """Launches of task kernels on an engine's device, on torch's current stream. All array arguments are torch tensors."""
+    """Launches task kernels on an engine's device, in torch's current stream. All array arguments are torch tensors."""
 
     def name_module(self) -> None:
-        """Launch one kernel of this file's module, so that the dry run before compilation finds the module."""
+        """Launch one kernel of this file, so that the dry run of `compile_ahead` finds the file's Warp module."""
         wp.launch(hold_joints, dim=1)
 
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
@@ -387,7 +387,7 @@ class TaskKernels(Launcher):
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
 
     def move_levels(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `TerrainCurriculum.update`. The caller computes the sums over robots."""
+        """Launch the kernel of `TerrainCurriculum.update`. The caller sums the last argument (`judged`) over robots."""
         self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
 
     def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:

@@ -25,7 +25,7 @@ GLIDE = np.array([0.25, 0.25, 0.06])
 so that it shakes less with the robot's steps.
 """
 CUT = 2.0
-"""Distance from the robot above which the view jumps to it, because the robot was moved to another place [m]."""
+"""If the view is farther than this from the robot [m], the robot was moved to another place, and the view jumps there."""
 ARROWS_EVERY = 3
 """Number of pictures after which the lengths of arrows are updated; their positions are updated in every picture."""
 VIEW = np.array([-1.75, -2.1, 1.15])
@@ -33,7 +33,7 @@ VIEW = np.array([-1.75, -2.1, 1.15])
 AMBIENT = 0.35
 """Brightness of the ambient light; if it is higher, light colours turn white."""
 FOG, SKY = (25.0, 55.0), (255, 255, 255)
-"""Distances at which the ground begins and ends to fade into the background [m], and the background's colour."""
+"""Distances at which the ground begins to fade, and at which it has faded completely [m]; and the background's colour."""
 HIDDEN = -1000.0
 """Height at which arrows are out of sight [m]."""
 NARROW = 700
@@ -45,10 +45,10 @@ SEGMENTS = 16
 FLANK = 0.85
 """Brightness of the vertical faces of a terrain relative to its treads."""
 SHARP = 30.0
-"""Angle between faces of a body above which their edge is drawn sharp [degrees]."""
+"""Faces of a body meet in a sharp edge if the angle between their normals is larger than about this angle [degrees]."""
 MATT = {"metallicFactor": 0.0, "roughnessFactor": 0.85}
 PERIOD, HALF_PLANE = 2.0, 40.0
-"""Distance after which the squares of a plane repeat, and half the side of the drawn plane, a multiple of the first [m]."""
+"""Period of a plane's checkerboard, and half the side of the drawn plane [m]. HALF_PLANE must be a multiple of PERIOD."""
 Part = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices (V, 3) [m], faces (F, 3) and sRGB colours (V, 3), 0 to 1."""
 
@@ -172,7 +172,7 @@ class Drawing:
 
 
 def _light(color: str) -> np.ndarray:
-    """Return a colour such as '#0072B2' as linear intensities (3,), 0 to 255, which arrows take instead of sRGB."""
+    """Return a colour such as '#0072B2' as linear intensities (3,), 0 to 255. Viser's arrows take these instead of sRGB."""
     return np.round(255.0 * srgb_to_linear(np.array(list(bytes.fromhex(color[1:]))) / 255.0))
 
 
@@ -184,7 +184,7 @@ def body_meshes(model: mujoco.MjModel) -> dict[int, trimesh.Trimesh]:
     parts: dict[int, list[Part]] = {}
     for geom in range(model.ngeom):
         body, material, rgba = int(model.geom_bodyid[geom]), int(model.geom_matid[geom]), model.geom_rgba[geom]
-        if material >= 0 and np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default, if the file sets no colour
+        if material >= 0 and np.allclose(rgba, (0.5, 0.5, 0.5, 1.0)):  # MuJoCo's default: the geom itself has no colour
             rgba = model.mat_rgba[material]
         if body == 0 or rgba[3] == 0.0 or model.geom_group[geom] >= camera.COLLISION_SHAPES:
             continue
@@ -231,7 +231,7 @@ def _split(mesh: trimesh.Trimesh, edges: np.ndarray) -> trimesh.Trimesh:
 def _with_visual(vertices: np.ndarray, faces: np.ndarray, visual: TextureVisuals) -> trimesh.Trimesh:
     """Return a mesh whose normal at each vertex is the mean normal of the adjacent faces, weighted by their areas."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # without scipy trimesh needs a slow loop
+    sides, normals = np.cross(b - a, c - a), np.zeros(vertices.shape)  # trimesh's own normals are slow without scipy
     for corner in range(3):
         np.add.at(normals, faces[:, corner], sides)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
@@ -270,7 +270,7 @@ def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Part:
-    """Return the upper side of a height field with the colours of its texture, in the same triangles as in MuJoCo."""
+    """Return the upper side of a height field in its texture's colours. It has the same triangles as in MuJoCo."""
     field = int(model.geom_dataid[geom])
     rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
     half_x, half_y, high, _ = model.hfield_size[field]

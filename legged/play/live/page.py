@@ -34,7 +34,8 @@ DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Return `port` (--port) if it is free on `host`; for 0 any free port, and for None the first free port from PORT on.
+    """Return `port` (--port) if it is free on `host`. For 0, return any free port. For None, return the first free port of
+    the TRIES ports from PORT on, or any free port if all of these are taken.
 
     Raises:
         ConfigError: the host is not an address of this machine, or the port does not exist or is taken.
@@ -45,7 +46,7 @@ def free_port(host: str, port: int | None) -> int:
         family = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][0]
     except (OSError, UnicodeError) as error:
         raise ConfigError(
-            f"--host: '{host}' is no address of this machine ({error}); {HOST} serves this machine alone"
+            f"--host: '{host}' is no address of this machine ({error}); {HOST} serves the page to this machine only"
         ) from error
     reason = ""
     for number in [port] if port is not None else [*range(PORT, PORT + TRIES), 0]:
@@ -55,7 +56,7 @@ def free_port(host: str, port: int | None) -> int:
         except OSError as error:
             reason = error.strerror or str(error)
     if port is None:
-        raise ConfigError(f"--host: no page can be served at '{host}' ({reason}); {HOST} serves this machine alone")
+        raise ConfigError(f"--host: no page can be served at '{host}' ({reason}); {HOST} serves it to this machine only")
     raise ConfigError(f"--port: {port} can't be used at '{host}' ({reason}); leave it out, and a free port is chosen")
 
 
@@ -94,11 +95,11 @@ class Page:
     def __init__(self, session: Session, host: str, port: int) -> None:
         """Start the server at `host` and `port`, which `free_port` finds."""
         viser = load_viser()
-        from legged.play.live.drawing import Drawing  # imported here, because trimesh comes with viser
+        from legged.play.live.drawing import Drawing  # imported here, because it needs trimesh, which comes with viser
 
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # hides viser's banner
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=session.task.cfg.task, verbose=False)
         self.port = int(self.server.get_port())
         # Viser would let any visitor publish the page through a public tunnel. This is switched off here.

@@ -29,7 +29,7 @@ LARGEST = 6
 LEFT, RIGHT, X_AXIS, FRAME = 44, 12, 30, 10
 """Width of the vertical axis, right margin, height of the time axis, and viser's margin around a chart [pixels]."""
 SMALLEST_RANGE = 0.25
-"""Least range of velocity axes, up and down from 0 [m/s, rad/s]."""
+"""Velocity axes reach at least this far up and down from 0 [m/s, rad/s]."""
 Lines = tuple[dict[str, Any], ...]
 """Options of several curves for uPlot."""
 
@@ -62,10 +62,10 @@ class History:
         self.rows.append(row)
 
     def curves(self) -> dict[str, np.ndarray]:
-        """Return a mapping: `times` (K,) relative to the newest step, at most 0 [s]; `actual` and `commanded` (3, K), vx, vy
-        [m/s], yaw rate [rad/s], base frame; `contacts` (F, K), 1 for feet on the ground; and `rewards` (terms, K), averaged
-        over the SMOOTHED_S before each step. In tasks without commands only the actual vx is known, in the world frame; the
-        other velocities are NaN.
+        """Return arrays by name. `times` (K,) are relative to the newest step, so at most 0 [s]. `actual` and `commanded`
+        (3, K) are vx, vy [m/s] and yaw rate [rad/s], base frame. `contacts` (F, K) are 1 for feet on the ground. `rewards`
+        (terms, K) are averaged over the SMOOTHED_S before each step. In tasks without commands only the actual vx is known,
+        in the world frame. All other velocities are then NaN.
         """
         feet = len(self.feet)
         table = np.array(self.rows).reshape(-1, 7 + feet + len(self.terms)).T
@@ -108,7 +108,7 @@ class LivePlots:
         time_axis: bool = True,
         least: float = SMALLEST_RANGE,
     ) -> Any:
-        """Return a chart without data whose plot area is `height` pixels high and whose vertical axis includes 0."""
+        """Return a chart without data. Its plot area is `height` pixels high, and its vertical axis includes 0."""
         # Mode 1 lets an axis end at the soft limit unless the data exceed it.
         low, high = ({"soft": limit, "mode": 1, "pad": 0.1} for limit in (-least, least))
         return self._server.gui.add_uplot(
@@ -134,7 +134,7 @@ class LivePlots:
                 chart.data = (times[shown], *(curve[shown] for curve in curves))
             if self._gait is not None:
                 self._gait.content = gait_diagram(history.feet, times, found["contacts"], history.dt)
-            if names != self._names:  # set only if names change, because the browser builds the chart anew then
+            if names != self._names:  # the browser builds the chart anew at each change of its curves
                 self._names = names
                 self._rewards.series = ({"label": "time [s]"}, *_reward_lines(names))
             self._rewards.data = (times[shown], *(curve[shown] for curve in rewards))
@@ -151,8 +151,8 @@ def _reward_lines(names: Sequence[str]) -> Lines:
 
 
 def reward_curves(terms: Sequence[str], values: np.ndarray) -> tuple[list[str], list[np.ndarray]]:
-    """Return names and curves (K,): the largest reward terms, LARGEST of them, then the sum of the other terms. `values`
-    (terms, K) are those of all `terms`.
+    """Return names and curves (K,). The first LARGEST curves are the largest reward terms. A last curve is the sum of all
+    other terms. `values` (terms, K) has one row for each of `terms`.
     """
     sizes = np.abs(np.nan_to_num(values)).sum(axis=1)
     largest = sorted(np.argsort(-sizes, kind="stable")[:LARGEST].tolist())

@@ -31,7 +31,7 @@ OWN, PLANE = "the task's own", "plane"
 HOURS_S = 36000.0
 """Length of an episode of robots that follow commands. It is long, so that no time-out interrupts the view [s]."""
 APART = 1.0
-"""If robots share a tile: largest distance of their starts from its middle, in x and in y, at terrain.scale 1 [m]."""
+"""Largest distance in x and in y of a start from the tile's middle, if robots share a tile and `terrain.scale` is 1 [m]."""
 MOST_ROBOTS = 16
 """Largest number of robots."""
 SLOWEST, FASTEST = 0.1, 4.0
@@ -82,15 +82,15 @@ class Watched:
             return None
         try:
             stat = path.stat()
-        except OSError:  # a newer file has just replaced it
+        except OSError:  # the file has just been removed
             return None
         before, self.shown = self.shown, (path, stat.st_mtime_ns, stat.st_size)
         return None if self.shown == before else path
 
 
 def find_watched(name: str | None, checkpoint: int | str | None) -> Watched:
-    """Return the run that `name`, the argument POLICY, stands for; if `name` is None, the newest run. The run need not have a
-    checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest.
+    """Return the run that the user named as POLICY (`name`), or the newest run if `name` is None. The run need not have a
+    checkpoint yet. `checkpoint` is an iteration, BEST, or None for the newest checkpoint.
 
     Raises:
         ConfigError: there is no such run, or it has no such checkpoint.
@@ -174,7 +174,7 @@ class Session:
         self.followed = 0
         """Number of the robot that the camera follows and the plots show."""
         self.pace = 1.0
-        """Simulated time of the last PACE_S as a share of the chosen speed; below 1 if the machine is too slow."""
+        """Measured speed over the last PACE_S as a share of the chosen speed. It is below 1 if the machine is too slow."""
         self._due = self._wanted = self._made = 0.0
         if self.checkpoint is not None:  # check the checkpoint before anything is built
             check_fits(self.checkpoint, read_checkpoint(self.checkpoint), watched.cfg)
@@ -272,7 +272,7 @@ class Session:
         self.command = self.clipped([*self.command[:axis], value, *self.command[axis + 1 :]])
 
     def stand(self) -> None:
-        """Set the command to zero or, where the training's ranges lack zero, to the value in the range nearest to zero."""
+        """Set each component of the command to zero or, if its range lacks zero, to the limit that is nearest to zero."""
         self.command = self.clipped([0.0, 0.0, 0.0])
 
     def select(self, robot: int) -> None:
@@ -282,8 +282,8 @@ class Session:
 
     @torch.inference_mode()
     def push(self, degrees: float, strength: float, everybody: bool = False) -> None:
-        """Push the followed robot, or all robots if `everybody`: change the velocity of the base by `strength` [m/s], in a
-        direction `degrees` to the left of the robot's heading.
+        """Push the followed robot, or all robots if `everybody`. A push changes the velocity of the base by `strength` [m/s].
+        Its direction is `degrees` to the left of the robot's heading.
         """
         if not self.can_be_pushed:
             return

@@ -1,1 +1,1 @@
-"""Import of robot models from URDF and any MJCF: a tree of links and hinges, and MJCF in the form that the engines need."""
+"""Import of robot models from URDF and any MJCF. A model becomes a tree of links and hinges, then MJCF for the engines."""

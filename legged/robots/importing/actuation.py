@@ -26,7 +26,9 @@ def guess_efforts(tree: Tree, legs: list[Leg], height: float) -> None:
         if hinge.driven and hinge.effort is None:
             hinge.effort = round((SHARE if hinge.name in of_legs else ELSEWHERE) * weight, 1)
             share = SHARE if hinge.name in of_legs else ELSEWHERE
-            tree.say(f"guess: torque limits that the file lacks are {share:g} m g h", f"{hinge.name} {hinge.effort:g} N m")
+            tree.say(
+                f"guess: torque limits missing in the file are set to {share:g} m g h", f"{hinge.name} {hinge.effort:g} N m"
+            )
 
 
 def speed_limits(tree: Tree) -> dict[str, float]:
@@ -38,13 +40,13 @@ def speed_limits(tree: Tree) -> dict[str, float]:
         return {}
     for hinge in driven:
         if hinge.velocity is None:
-            tree.say(f"guess: speed limits that the file lacks are {VELOCITY_LIMIT:g} rad/s", hinge.name)
+            tree.say(f"guess: speed limits missing in the file are set to {VELOCITY_LIMIT:g} rad/s", hinge.name)
     return {hinge.name: hinge.velocity or VELOCITY_LIMIT for hinge in driven}
 
 
 def give_rotors(tree: Tree, angles: dict[str, float]) -> None:
-    """Add a rotor inertia (armature) to the wheels that are too light for a stable gain on their speed, in the pose at
-    `angles` [rad].
+    """Add a rotor inertia (armature) to the wheels that are too light for a stable gain on their speed. The inertias of the
+    wheels are those in the pose at `angles` [rad].
     """
     wheels = [hinge for hinge in tree.hinges if hinge.rolls and hinge.driven]
     poser = Poser(tree)
@@ -78,7 +80,7 @@ def take_gains(
     tree: Tree, angles: dict[str, float], feet: Sequence[str], height: float
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return hinge -> P gain [N m/rad] and hinge -> D gain [N m s/rad] of the file's position actuators. Other hinges have
-    the gains of `rule_gains`; a wheel's velocity actuator may lower them.
+    the gains of `rule_gains`, but the gain of a wheel is at most that of its velocity actuator in the file.
 
     If an actuator has no D gain, the damping of the joint becomes the D gain and is removed from the joint. Both tables are
     empty if the file has no gains, if nothing is damped, if the explicit law would be unstable, or if the robot would sink
@@ -88,7 +90,7 @@ def take_gains(
     if not stated:
         return {}, {}
     damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in stated}
-    if not any(damping.values()):  # without damping the motion is on the edge of instability, and rounding errors decide
+    if not any(damping.values()):  # without damping, rounding errors would decide if the law counts as stable
         tree.say("gains of the file's position actuators are left out: neither actuators nor joints have any damping")
         return {}, {}
     p, d = rule_gains(tree, angles, feet, height)
@@ -124,7 +126,7 @@ def take_gains(
 
 
 def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], feet: Sequence[str]) -> dict[str, float]:
-    """Return hinge -> deflection under the robot's weight [rad] for all driven hinges but wheels. The base is level."""
+    """Return hinge -> deflection under the robot's weight [rad] for all driven hinges except wheels. The base is level."""
     stiffness = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and not hinge.rolls}
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -135,7 +137,7 @@ def _sags(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], fee
 
 def growth(tree: Tree, angles: dict[str, float], stiffness: dict[str, float], damping: dict[str, float]) -> float:
     """Return the largest factor by which a deviation from the pose at `angles` [rad] grows in one step of semi-implicit Euler
-    with explicit torques -K q - D v and a free base. K of a wheel acts on its speed. The joint's damping counts if D is 0.
+    with explicit torques -K q - D v and a free base. K of a wheel acts on its speed. A joint with D = 0 keeps its damping.
     """
     rolls = {hinge.name: stiffness[hinge.name] for hinge in tree.hinges if hinge.driven and hinge.rolls}
     stiffness, damping = stiffness | dict.fromkeys(rolls, 0.0), damping | rolls

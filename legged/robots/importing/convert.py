@@ -22,8 +22,8 @@ URDF = ".urdf"
 def robot_spec_of(path: Path, drawn: bool = False) -> mujoco.MjSpec:
     """Return the MuJoCo spec of a robot.
 
-    A URDF, and MJCF that was written for another use, are adapted: everything of a scene but the robot is removed, the base
-    floats, welded links are merged, driven hinges have motors in the order of the hinges, and each collision shape is a
+    A URDF, and MJCF that was written for another use, are adapted: everything in a scene except the robot is removed, the
+    base floats, welded links are merged, driven hinges have motors in the order of the hinges, and each collision shape is a
     primitive with a name. The adapted model has visual shapes only if `drawn`.
 
     Raises:
@@ -47,7 +47,7 @@ def adaptations(path: Path) -> tuple[str, ...]:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Return the time of the last change and the size of a file, which identify one state of it."""
+    """Return the time of a file's last change and its size. Together they identify the state of the file."""
     found = path.stat()
     return found.st_mtime_ns, found.st_size
 

@@ -1,5 +1,6 @@
-"""Dynamics of an MJCF file that the imported model lacks. They are reported; the file is refused if the robot would move
-differently without them.
+"""Report of what the imported model leaves out of the dynamics in an MJCF file. The file is refused if a muscle drives the
+robot. It is also refused if, at rest, a joint would lack more than a tenth of its torque limit, or the base would lack a
+force of more than a tenth of the robot's weight.
 
 The imported model has masses, hinges with their limits, springs, damping, armature and friction loss, torque limits, gains of
 position and velocity actuators, connect and joint constraints, and the sliding friction of shapes.
@@ -16,7 +17,7 @@ from legged.robots.importing.tree import Tree
 POSES = 8
 """Number of poses in which lost torques are computed."""
 SHARE = 0.1
-"""Largest share of a joint's torque limit, or of the robot's weight on the base, that may be left out."""
+"""Largest torque that may be left out, in torque limits of the joint, and largest force on the base, in robot weights."""
 LEVER = 0.1
 """Lever arm [m]. The robot's weight times this length stands in for the torque limit of joints without one."""
 ARRAYS = (
@@ -26,7 +27,7 @@ ARRAYS = (
     ("gravity compensation is left out", "body", "gravcomp"),
     ("properties of actuators are left out", "actuator", "damping armature delay"),
 )
-"""Line for the user, kind of element, and properties: arrays of MuJoCo's model that hold 0 for elements without them."""
+"""Line for the user, kind of element, and names of properties. Elements without a property have 0 in MuJoCo's array."""
 UNEVEN = "torque limits that differ by direction become the smaller one"
 FILTERS = "filters and states of actuators are left out; control.actuator.delay can stand in for them"
 LAWS = "actuators other than motors, position servos and velocity servos become motors with the task's control law"
@@ -46,7 +47,7 @@ def account_for(model: mujoco.MjModel, tree: Tree) -> None:
         parts = "; ".join(f"{line}: {about}" for line, about in left_out)
         raise ConfigError(
             f"{tree.source}: {name} would lack up to {lost:.3g} of {whole:.3g} N m, because engines here do not simulate"
-            f" everything in the file ({parts[:300]}); express it by stiffness and springref of joints"
+            f" everything in the file ({parts[:300]}); model the missing forces by stiffness and springref of joints"
         )
     for i in np.flatnonzero(model.actuator_gaintype == mujoco.mjtGain.mjGAIN_MUSCLE).tolist():
         raise ConfigError(
@@ -83,8 +84,8 @@ def _left_out(model: mujoco.MjModel) -> Iterator[tuple[str, str]]:
 
 
 def _lost_torque(model: mujoco.MjModel, tree: Tree) -> tuple[str, float, float]:
-    """Return the name of the joint that loses the largest share of its torque because forces are left out, the torque that it
-    loses at rest, and its torque limit [N m]. It may be the base instead, with a lost force and the weight [N].
+    """Return (name, left-out torque at rest, torque limit) [N m] of the joint for which this torque is the largest share of
+    the limit. If the share of the base is larger, return ('the base', left-out force, weight) [N].
     """
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     named = {model.joint(i).name: model.joint(i) for i in range(model.njnt)}

@@ -16,7 +16,7 @@ from legged.robots.importing.shapes import free_name
 from legged.robots.importing.tree import Mesh, Tree
 
 ACTION_SCALE = 0.5
-"""Action scale of the other joints of a robot with wheels [rad]."""
+"""Action scale of joints without a wheel, for a robot that has wheels [rad]."""
 
 
 @dataclass
@@ -29,7 +29,7 @@ class Guesses:
     angles: dict[str, float]
     """Angles of the driven hinges in the default pose [rad]."""
     angles_from: str
-    """Source of these angles, for a comment in robot.yaml."""
+    """Source of `angles`, for a comment in robot.yaml."""
     passive: Sequence[str]
     """Hinges without a motor."""
     feet: Sequence[str]
@@ -128,8 +128,8 @@ def _table(key: str, values: dict[str, float], unit: str) -> list[str]:
 
 
 def _compact(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a table with shorter patterns, namely names without their first part, if each joint still gets its value; else
-    `values`.
+    """Return `values` (joint name -> value) with shorter keys: names without the part before the first underscore. If a joint
+    would get a wrong value from the shorter keys, return `values` unchanged.
     """
     parts = {name: name.partition("_")[2] or name for name in values}
     table = {parts[name]: value for name, value in values.items()}
@@ -186,5 +186,5 @@ def task_yaml(name: str, robot: str, extends: str, symmetric: bool, guesses: Gue
         lines += ["# Actions are angles of joints [rad], and speeds of wheels [rad/s].", "control:"]
         lines += [f"  {key}: {_map(table)}" for key, table in (("control_type", laws), ("action_scale", scales))]
     if not symmetric:
-        lines += ["# Its left side is not the mirror image of its right one.", "train: {algorithm: {symmetry: false}}"]
+        lines += ["# The left and right sides of the robot are not mirror images.", "train: {algorithm: {symmetry: false}}"]
     return "\n".join([*lines, ""])

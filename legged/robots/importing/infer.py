@@ -1,5 +1,5 @@
-"""Completion of a Tree that was read from a file, until it has all that robot.yaml states: repairs, names, default pose, feet
-and gains. Values that the file does not state are inferred, and reported as guesses.
+"""Completion of a robot that was read from a file into a Tree: repairs, names, default pose, feet and gains, as robot.yaml
+needs them. Values that the file does not state are inferred, and reported as guesses.
 """
 
 import re
@@ -24,15 +24,15 @@ from legged.robots.importing.wheels import find_wheels
 from legged.robots.stance import lowest_point, standing_height
 
 LIGHT = 0.005
-"""Fingers that move a smaller share of the robot's mass are held."""
+"""Finger joints that move less than this share of the robot's mass are held."""
 MIDDLE = 0.01
-"""Largest distance from the middle plane at which a link of the trunk may begin [m]."""
+"""Largest distance of the origin of a trunk's link from the xz plane of the base [m]."""
 SOLE = re.compile(r"foot|feet|toe|sole|heel", re.IGNORECASE)
 """Pattern in the names of the shapes that stand on the ground behind a toe."""
 ABOVE = 1.03
 """Spawn height as a multiple of the height of the standing base."""
 WIDEST = 0.8
-"""Largest half length of a guessed trunk, as a share of the distance from the base to the farthest foot."""
+"""Largest half length of a guessed trunk box, as a share of the distance from the base to the farthest foot."""
 LOST_FOOT = 0.25
 """Largest distance of a foot from its goal in a stance, as a share of the leg's length. Links farther away are not feet."""
 LEVEL = 0.01
@@ -44,7 +44,7 @@ LOST = 1e-6
 
 
 def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
-    """Return the robot of a URDF or MJCF file without repairs. For `roots` and `drawn` see `read_urdf`.
+    """Return the robot of a URDF or MJCF file; nothing is repaired yet. For `roots` and `drawn` see `read_urdf`.
 
     Raises:
         ConfigError: the file is neither URDF nor MJCF, or holds no robot.
@@ -56,13 +56,13 @@ def read_robot(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tr
         return read_urdf(path, roots, drawn) if b"<robot" in head and b"<mujoco" not in head else read_mjcf(path, drawn)
     if path.suffix.lower() == ".xacro":
         plain = f"{path.name.split('.')[0]}.plain.urdf"
-        raise ConfigError(f"{path}: is a xacro file; write the URDF first: xacro {path.name} > {plain}")
+        raise ConfigError(f"{path}: is a xacro file; write the URDF first with `xacro {path.name} > {plain}`")
     raise ConfigError(f"{path}: expected a URDF (.urdf) or an MJCF file (.xml, .mjcf)")
 
 
 def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] | None = None) -> Guesses:
-    """Repair a tree in place and infer the values that its file does not state. `gains`, P [N m/rad] and D [N m s/rad],
-    replace those of the file for all joints but wheels.
+    """Repair a tree in place and infer the values that its file does not state. `gains` are P [N m/rad] and
+    D [N m s/rad]. They replace the gains in the file for all joints but wheels.
 
     Raises:
         ConfigError: the tree has no robot with legs, or mass was lost.
@@ -117,8 +117,8 @@ def make_ready(tree: Tree, hold: Sequence[str] = (), gains: tuple[float, float] 
 
 
 def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
-    """Return hinge -> action scale [rad/s] for the driven wheels on which legs stand. With it, action 1 drives the robot at
-    half of sqrt(g h), where h is the base's `height` [m].
+    """Return hinge -> action scale [rad/s] for the driven wheels on which legs stand. If the action of all wheels is 1, the
+    robot drives at 0.5 sqrt(g h) [m/s], where h is the base's `height` [m].
     """
     found = {}
     for leg in legs:
@@ -129,8 +129,8 @@ def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
 
 
 def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool:
-    """Add to the feet of each leg the shapes of its last link that are about as low as the lowest of them in the pose at
-    `angles` [rad]. Return True if any leg has more feet now.
+    """Make a shape of a leg's last link a foot if it is about as low as the lowest shape of this link in the pose at `angles`
+    [rad]. Return True if any leg has more feet now.
     """
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -148,9 +148,9 @@ def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool
 
 
 def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float) -> set[str]:
-    """Return the names of all shapes of feet, including those that do not touch the ground. A foot is the link of the file
-    that touches the ground, if it was merged into the leg's last link, or if the hinge of the last link is near the ground
-    in the pose at `angles` [rad], with the base at `height` [m].
+    """Return the names of all shapes of feet, including shapes that do not touch the ground. A foot is a link of the file
+    that was merged into a leg's last link and touches the ground. The last link itself is a foot only if its hinge is near
+    the ground, like an ankle, in the pose at `angles` [rad] with the base at `height` [m].
     """
     poser = Poser(tree)
     data = poser.pose(angles)
@@ -164,7 +164,7 @@ def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float)
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Rename feet whose names are part of another shape's name: patterns in robot.yaml match all names that contain them."""
+    """Rename feet whose names are part of another shape's name. A pattern in robot.yaml would match both."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}
@@ -189,7 +189,7 @@ def _name_passive(tree: Tree, legs: list[Leg]) -> None:
 
 
 def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
-    """Rename the shapes `role` (names) whose name is part of the name of a shape not in `role`; return the new `role`."""
+    """Rename each shape of `role` (names) if its name is part of the name of a shape outside `role`. Return the new names."""
     named = {shape.name: shape for shape in tree.shapes}
     shapes = [named[name] for name in role]
     for shape in shapes:
@@ -202,8 +202,8 @@ def _named_apart(tree: Tree, role: Sequence[str]) -> list[str]:
 
 
 def _exact(tree: Tree, names: Sequence[str]) -> list[str]:
-    """Return patterns that match exactly the shapes `names`: one word if it is in all their names and in no others, else
-    their names. None of `names` may be part of another shape's name.
+    """Return patterns that match the shapes `names` and no other shapes: one word, such as "foot", if it is in all of `names`
+    and in no other shape's name. Otherwise, return names. No name of another shape may contain one of `names`.
     """
     others = [shape.name for shape in tree.shapes if shape.name not in names]
     for word in ("foot", "FOOT", "Foot", "toe", "calf", "shank"):
@@ -247,7 +247,7 @@ def _trunk(tree: Tree, legs: list[Leg]) -> list[int]:
 
 
 def _reach(tree: Tree, legs: list[Leg]) -> float:
-    """Return the distance from the base to the farthest foot with all joints at 0 [m]."""
+    """Return the distance [m] from the base to the farthest foot, with all joint angles at 0."""
     poser = Poser(tree)
     poser.pose({})
     return max(float(np.linalg.norm(poser.point(leg.end, leg.tip))) for leg in legs)
@@ -278,17 +278,17 @@ def _default_pose(tree: Tree, legs: list[Leg]) -> tuple[dict[str, float], str]:
             origin = f"of the keyframe '{tree.home_name}'"
             tree.say(f"the default pose is that of the keyframe '{tree.home_name}'")
             return {name: round(angle, 4) + 0.0 for name, angle in angles.items()}, origin
-        tree.say(f"the keyframe '{tree.home_name}' is no stance (its feet are not level, or a joint is beyond its range)")
+        tree.say(f"the keyframe '{tree.home_name}' is no stance (the feet are not level, or a joint is beyond its range)")
     angles, miss = standing_angles(tree, legs)
     tree.say("guess: the default pose is a stance by inverse kinematics: base level, feet under the hips, knees bent")
     if miss > LOST_FOOT:
         feet = ", ".join(tree.links[leg.end].name for leg in legs)
         raise ConfigError(
             f"{tree.source}: the robot can't stand on {feet}: with the base level, one of these links stays {miss:.0%} of a"
-            f" leg's length away from its place under the hip. Are they feet? --hold can fix joints that belong to no leg"
+            f" leg's length away from its place under the hip. If a link is no foot, --hold can fix its joints"
         )
     if miss > GOOD:
-        tree.say(f"guess: in that pose a foot is {miss:.0%} of a leg's length away from its place under the hip; look at it")
+        tree.say(f"guess: look at the default pose: a foot is {miss:.0%} of a leg's length away from its place under the hip")
     return angles, "guess: a stance by inverse kinematics"
 
 

@@ -12,7 +12,7 @@ from legged.robots.importing.legs import ANKLE, SAMPLES, Leg, Poser
 from legged.robots.importing.tree import Tree, Vector
 
 STRETCH, UPRIGHT = 0.8, 0.96
-"""Distances from hip to foot as shares of the stretched leg's length: of robots with three legs or more, and of bipeds."""
+"""Distance from hip to foot as a share of the stretched leg's length, for robots with three legs or more and for bipeds."""
 OUTWARD = 0.5
 """Largest sideways distance of a foot from its hip, as a share of the stretched leg's length."""
 MARGIN = 0.05
@@ -21,9 +21,9 @@ TRIES, ROUNDS = 24, 60
 STEP = 1e-5
 """Step of the finite differences [rad]."""
 GOOD = 0.05
-"""Largest distance of a foot from its goal, as a share of the leg's length."""
+"""Largest distance of a foot from its goal in a good stance, as a share of the leg's length."""
 KNEES = 0.002
-"""Weight, in the cost, of knees on the wrong side of the hip. It is so small that it decides only between similar costs."""
+"""Weight of the cost of knees on the wrong side of the hip. It is small, and decides only between stances of similar cost."""
 LATERAL = 0.7
 """Least absolute y component of the axis of a hinge that bends a leg forward."""
 
@@ -35,15 +35,15 @@ class _Limb:
     leg: Leg
     partner: Leg | None
     signs: Vector
-    """(hinges,) signs, 1 or -1, with which the partner takes the leg's angles."""
+    """(hinges,) signs, 1 or -1. The partner's angles are the leg's angles times these signs."""
     ranges: Vector
-    """(hinges, 2) ranges of the leg's angles [rad]. Times `signs`, they are within the partner's ranges too."""
+    """(hinges, 2) ranges of the leg's angles [rad]. In these ranges, the partner's angles are within their limits too."""
     hip_name: str
     """First hinge that bends the leg forward."""
     hip: Vector
     """(3,) position of the hinge `hip_name` at zero angles [m]."""
     side: float
-    """Goal of the foot along y [m]: its place at zero angles, but at most `OUTWARD` from the hip."""
+    """y coordinate of the foot's goal [m]: the foot's y at zero angles, but at most `OUTWARD * length` from the hip."""
     knee: int
     """Index of the link of the second hinge that bends the leg forward."""
     length: float
@@ -171,7 +171,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
             mirrored = np.sign((axes * [-1.0, 1.0, -1.0] * theirs).sum(axis=1))
             mapped = np.sort(mirrored[:, None] * [_kept(poser, name) for name in legs[partner].hinges], axis=1)
             both = np.stack([np.maximum(ranges, mapped)[:, 0], np.minimum(ranges, mapped)[:, 1]], axis=1)
-            if (both[:, 0] <= both[:, 1]).all():  # the two legs have angles in common
+            if (both[:, 0] <= both[:, 1]).all():  # the ranges of the two legs overlap
                 other, signs, ranges = legs[partner], mirrored, both
                 taken.add(int(partner))
         bends = [k for k, axis in enumerate(axes) if abs(axis[1]) > LATERAL] or list(range(len(axes)))
@@ -184,7 +184,7 @@ def _limbs(tree: Tree, legs: list[Leg], poser: Poser) -> list[_Limb]:
         limbs.append(_Limb(leg, other, signs, ranges, hip_name, hip, side, knee, 1.0, level))
     for limb in limbs:
         limb.length = _stretched(poser, limb)
-        out = OUTWARD * limb.length  # a leg that points sideways at zero angles stands closer to its hip
+        out = OUTWARD * limb.length  # if a leg points sideways at zero angles, its foot has to stand closer to the hip
         limb.side = float(np.clip(limb.side, limb.hip[1] - out, limb.hip[1] + out))
     return limbs
 

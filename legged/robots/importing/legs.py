@@ -23,7 +23,7 @@ ANKLE = 4
 """A leg with at least this number of hinges has an ankle and a sole."""
 SAMPLES = 300
 NEARLY = 0.7
-"""Least depth below the base that a foot can reach, as a share of the depth that the lowest foot can reach."""
+"""A chain is a leg if its end can reach at least this share of the largest depth below the base that any end can reach."""
 
 
 @dataclass
@@ -33,9 +33,9 @@ class Leg:
     links: list[int]
     """Indices of the links from the base's child to the foot."""
     hinges: list[str]
-    """Names of the hinges of these links, except the hinge of a wheel at the end."""
+    """Names of the hinges of `links`, except the hinge of a wheel at the end."""
     tip: Vector
-    """(3,) lowest point of the leg, in the frame of its last link."""
+    """(3,) point of the leg that stands on the ground, in the frame of the last link [m]: the mean position of `feet`."""
     feet: list[Shape]
     """Shapes of the last link that touch the ground."""
 
@@ -44,7 +44,7 @@ class Leg:
         return self.links[-1]
 
     def touch(self, shapes: list[Shape]) -> None:
-        """Make `shapes` of the last link the feet, and the mean of their positions the tip."""
+        """Set `feet` to `shapes`, which belong to the last link, and `tip` to the mean of their positions."""
         self.feet, self.tip = shapes, np.mean([shape.pos for shape in shapes], axis=0)
 
 
@@ -84,7 +84,9 @@ class Poser:
 
 
 def face_forward(tree: Tree) -> None:
-    """Turn a robot upright along z, with its left side towards +y. Both are guessed from its legs and their names."""
+    """Turn a robot upright along z, with its left side towards +y. The vertical axis is guessed from the ends of the legs,
+    and the left side from their names.
+    """
     poser = Poser(tree)
     poser.pose({})
     ends = [i for i, link in enumerate(tree.links) if not tree.children(i) and not HAND.search(link.name)]
@@ -116,8 +118,8 @@ def side_of(name: str) -> int:
 
 
 def find_legs(tree: Tree) -> list[Leg]:
-    """Return the legs, in the order of the file: the chains whose ends reach lowest. Names of feet,
-    arms and heads tell which chains are considered.
+    """Return the legs in the order of the file. A leg is a chain of links whose end reaches low enough (see `NEARLY`). The
+    names of feet, arms and heads tell which chains are considered.
 
     Raises:
         ConfigError: no chain, or only one, reaches below the base.
@@ -174,8 +176,8 @@ def _reach(poser: Poser, ends: list[int]) -> dict[int, float]:
 
 
 def _tip(tree: Tree, i: int) -> Vector:
-    """Return the tip (3,) of a link: of the ends of its shapes (see `_ends`), the one farthest from the hinge. A link without
-    shapes has its tip at its centre of mass.
+    """Return the tip (3,) of a link in its own frame [m]: the point farthest from the hinge among the ends of the collision
+    shapes (see `_ends`). A link without collision shapes has its tip at its centre of mass.
     """
     link = tree.links[i]
     anchor = link.hinges[0].anchor if link.hinges else np.zeros(3)
@@ -197,7 +199,7 @@ def _ends(shape: Shape) -> list[Vector]:
 
 
 def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
-    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A rod gets a ball."""
+    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A ball is added to a rod."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
     if any(hinge.rolls for hinge in link.hinges):
@@ -220,8 +222,8 @@ def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
 
 
 def _uncover(tree: Tree, leg: Leg) -> None:
-    """Shorten a shape that was fitted to one mesh of shank and foot, so that the foot, a ball, touches the ground first. The
-    shape then ends half its width above the centre of the foot, so that the leg can lean by 45 degrees.
+    """Shorten a shape whose mesh includes both shank and foot, so that the ball at the foot touches the ground first. The
+    shape then ends half its width above the ball's centre, which lets the leg lean by 45 degrees.
     """
     if len(leg.feet) != 1 or leg.feet[0].kind != "sphere":
         return
@@ -238,8 +240,8 @@ def _uncover(tree: Tree, leg: Leg) -> None:
 
 
 def _long_side(shape: Shape, tip: Vector) -> tuple[Vector, int]:
-    """Return the direction (3,) along a shape's longest side that points towards `tip` (3,), and the index in `size` of half
-    of this side (of a capsule, half of the straight part).
+    """Return the direction (3,) of a shape's longest side, towards `tip` (3,), and the index of this side in `shape.size`.
+    For a capsule, this entry of `size` is half the length of the straight part.
     """
     half = half_lengths(shape)
     assert half is not None

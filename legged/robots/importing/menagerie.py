@@ -17,7 +17,7 @@ def menagerie_model(name: str) -> tuple[Path, str]:
     try:
         import mujoco_menagerie
     except ImportError as error:
-        raise ConfigError(f"{PREFIX}{name}: needs a package: pip install mujoco-menagerie") from error
+        raise ConfigError(f"{PREFIX}{name}: needs a package; run `pip install mujoco-menagerie`") from error
     names = mujoco_menagerie.names()
     if name not in names:
         raise ConfigError(f"{PREFIX}{name}: Menagerie has no such robot{suggest(name[:100], names, 'robots')}")
@@ -27,5 +27,5 @@ def menagerie_model(name: str) -> tuple[Path, str]:
     except (mujoco_menagerie.MenagerieError, OSError) as error:
         raise RunError(f"{PREFIX}{name}: {' '.join(str(error).split())}") from error
     if not path.is_file():
-        raise RunError(f"{PREFIX}{name}: {path} is missing; check downloads: python -m mujoco_menagerie verify")
+        raise RunError(f"{PREFIX}{name}: {path} is missing; check the downloads with `python -m mujoco_menagerie verify`")
     return path, robot.license

@@ -20,7 +20,7 @@ READ = (".stl", ".obj", ".msh")
 MOST_FACES = 200_000
 """Largest number of faces that MuJoCo accepts in an STL file."""
 ENOUGH_FACES = 50_000
-"""Largest number of faces of a mesh that was simplified because it had too many."""
+"""A mesh with more than `MOST_FACES` faces is simplified until it has at most this number."""
 FINEST = 600
 """Number of grid cells along the longest side of a mesh at the first attempt to simplify it."""
 LONGEST = 3.0
@@ -30,7 +30,7 @@ STL_HEADER, STL_FACE = 84, 50
 
 
 class MeshProblem(Exception):
-    """A mesh that can't be used; the text states the reason."""
+    """A mesh can't be used. The message of the exception states the reason."""
 
 
 class MeshMissing(MeshProblem):
@@ -47,7 +47,7 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
     parts = [part for part in Path(path).parts if part not in ("/", "\\")]
     places = [folder, *folder.parents, *roots]
-    # Shorter tails lack the name of the package, or the first folders of a path on another machine.
+    # A tail is the path without its first parts, such as the name of a package, or folders of another machine.
     tails = [parts[i:] for i in range(len(parts))]
     options = [Path(path)] if Path(path).is_absolute() else [folder / path]
     options += [place.joinpath(*tail) for tail in tails[:2] for place in places]
@@ -73,8 +73,8 @@ def ignoring_case(path: Path) -> Path | None:
 
 
 def find_by_name(name: str, folder: Path) -> Path:
-    """Return the only file with the file name of `name` in the subfolders of `folder` and the folders next to it. This finds
-    meshes whose paths in a URDF are wrong.
+    """Find a mesh whose path `name` in a URDF is wrong: return the only file with the same file name in the subfolders of
+    `folder` and in the folders next to `folder`.
 
     Raises:
         MeshMissing: there is no such file, or there are several.
@@ -88,8 +88,8 @@ def find_by_name(name: str, folder: Path) -> Path:
 
 
 def read(path: Path, scale: Vector) -> list[tuple[Mesh, Vector | None]]:
-    """Return the meshes of a file, with the factors `scale` (3,), in a form that MuJoCo reads. Each has its colour (4,) or
-    None.
+    """Return pairs (mesh, colour) of a file, in a form that MuJoCo reads. The meshes are scaled by `scale` (3,). A colour is
+    RGBA (4,), or None.
 
     Raises:
         MeshProblem: MuJoCo does not read the file, and it can't be converted.
@@ -130,11 +130,11 @@ def _converted(path: Path) -> list[tuple[Vector, Vector, Vector | None]]:
     try:
         import trimesh
     except ImportError as error:
-        raise MeshProblem(f"{path.name}: MuJoCo does not read {path.suffix}; pip install trimesh pycollada") from error
+        raise MeshProblem(f"{path.name}: MuJoCo does not read {path.suffix}; run `pip install trimesh pycollada`") from error
     try:
         scene = trimesh.load_scene(path)
         parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    except Exception as error:  # any reader that trimesh calls may raise any class
+    except Exception as error:  # the readers that trimesh calls raise many classes of errors
         raise MeshProblem(f"{path.name}: can't be converted ({type(error).__name__}: {error})"[:200]) from error
     if not parts:
         raise MeshProblem(f"{path.name}: has no faces")
@@ -145,7 +145,7 @@ def _colour(part: Any) -> Vector | None:
     """Return the colour (4,) of a part; None if it has no single colour or is invisible."""
     try:
         rgba = np.array(part.visual.to_color().main_color, dtype=float) / 255.0
-    except Exception:  # for example, because a texture is missing
+    except Exception:  # a missing texture, for example, raises an error
         return None
     return rgba if rgba.shape == (4,) and rgba[3] > 0.0 else None
 
@@ -170,8 +170,8 @@ ROUND = 1.25
 
 
 def fitted(shape: Shape) -> Shape:
-    """Return a shape with a primitive in place of its mesh: the smallest of those that MuJoCo fits to the mesh's bounding
-    box. Only a round mesh becomes a sphere.
+    """Return a shape whose mesh is replaced by the smallest primitive (capsule, box or sphere) that MuJoCo fits to the mesh's
+    bounding box. Only a round mesh becomes a sphere.
 
     Raises:
         MeshProblem: MuJoCo refuses the mesh.
@@ -199,12 +199,12 @@ def check_length(source: Path, shape: Shape, points: Vector | None) -> None:
         name = shape.mesh.file.name if shape.mesh is not None and shape.mesh.file is not None else shape.name
         raise ConfigError(
             f"{source}: link '{shape.link}': mesh '{name}' is {length:.4g} m long; if it is in millimetres, add"
-            ' scale="0.001 0.001 0.001"'
+            ' scale="0.001 0.001 0.001" to its <mesh>'
         )
 
 
 def vertices(mesh: Mesh) -> Vector | None:
-    """Return the vertices (V, 3) of a mesh [m] in memory or in a binary STL file; None for files that take long to read."""
+    """Return the vertices (V, 3) [m] of a mesh in memory or in an STL file; None for other files, which take long to read."""
     if mesh.file is None or mesh.file.suffix.lower() != ".stl":
         return mesh.vertices
     face = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("attribute", "<u2")])
@@ -213,13 +213,13 @@ def vertices(mesh: Mesh) -> Vector | None:
 
 
 def rounded(shape: Shape) -> Shape:
-    """Return a shape as the sphere or capsule, whichever is smaller, that was fitted to its mesh: point feet are round."""
+    """Return a round shape for a point foot: the smaller one of the capsule and the sphere that were fitted to its mesh."""
     options = [kind for kind in ("capsule", "sphere") if kind in shape.fits]
     return refitted(shape, min(options, key=lambda kind: _volume(kind, shape.fits[kind][0]), default=shape.kind))
 
 
 def refitted(shape: Shape, kind: str) -> Shape:
-    """Return a shape as the primitive of kind `kind` that was fitted to its mesh; unchanged if there is no such primitive."""
+    """Return the primitive `kind` that was fitted to the mesh of a shape, or a copy of the shape if there is none."""
     size, pos, quat = shape.fits.get(kind, (shape.size, shape.pos, shape.quat))
     kind = kind if kind in shape.fits else shape.kind
     return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())

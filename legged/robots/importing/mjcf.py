@@ -49,8 +49,8 @@ def read_mjcf(path: Path, drawn: bool = True) -> Tree:
 
 
 def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True, said: Sequence[tuple[str, str]] = ()) -> Tree:
-    """Return the heaviest robot in a spec that was read from the file `path`; the spec is changed in place. `said` are lines
-    about changes made while reading, each with the name of the thing that was changed.
+    """Return the heaviest robot in a spec that was read from the file `path`; the spec is changed in place. `said` are
+    messages about changes made while reading, each with the name of the thing that was changed.
 
     Raises:
         ConfigError: MuJoCo refuses the spec, or no body in it moves.
@@ -77,7 +77,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     _name_joints(spec)
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for geom in spec.geoms:
-        if geom.name and geom.name in paired:  # a geom of a contact pair collides whatever its contype and conaffinity
+        if geom.name and geom.name in paired:  # geoms of a contact pair collide even if contype and conaffinity are 0
             geom.contype = geom.contype or 1
     for kind in ("sensors", "pairs", "tuples", "skins"):
         for element in list(getattr(spec, kind)):
@@ -99,7 +99,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
     try:
         return spec.compile()
     except Exception as error:
-        for key in list(spec.keys):  # keyframes of a scene with more joints may be the reason
+        for key in list(spec.keys):  # keyframes of a scene with more joints may cause the error
             spec.delete(key)
         try:
             return spec.compile()
@@ -108,7 +108,7 @@ def _compiled(spec: mujoco.MjSpec, path: Path, tree: Tree, drawn: bool) -> mujoc
 
 
 def _name_joints(spec: mujoco.MjSpec) -> None:
-    """Name the unnamed joints of each body except the first one, which is called `<body>_joint` later."""
+    """Name the unnamed joints of each body. A body's first unnamed joint is left out: it is called `<body>_joint` later."""
     taken = {joint.name for joint in spec.joints}
     for body in spec.bodies[1:]:
         for joint in [joint for joint in body.joints if not joint.name][1:]:
@@ -117,7 +117,7 @@ def _name_joints(spec: mujoco.MjSpec) -> None:
 
 
 def drop_visual_meshes(spec: mujoco.MjSpec, path: Path) -> None:
-    """Remove visual meshes from a spec that was read from `path`, because reading them takes most of the time. Meshes with
+    """Remove visual meshes from a spec that was read from `path`, because they take longest to read. Meshes with
     missing files and meshes from which a mass is computed stay.
     """
     folder = path.parent / (spec.meshdir or "")
@@ -139,7 +139,9 @@ def mesh_name(mesh: mujoco.MjsMesh) -> str:
 
 
 def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
-    """Return the robot's base: of the bodies on the world that have a hinge below them, the one that carries most mass."""
+    """Return the id of the robot's base. Of the world's children that have a hinge below them, the base is the one that
+    carries most mass.
+    """
     turned = [int(body) for body in model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]]
     moved = {root for body in turned if (root := int(model.body_rootid[body])) != body}
     tops = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
@@ -156,10 +158,10 @@ def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
         tree.say(f"left out: {' and '.join(what)}; the task brings the ground")
     own = [int(i) for i in range(model.njnt) if model.jnt_bodyid[i] == root]
     if not own:
-        tree.say(f"body '{_name(model, root)}' is fixed to the world: here it floats")
+        tree.say(f"body '{_name(model, root)}' is fixed to the world in the file, but floats in the model")
     elif model.jnt_type[own[0]] != mujoco.mjtJoint.mjJNT_FREE:
         names = ", ".join(model.joint(i).name or "unnamed" for i in own)
-        tree.say(f"body '{_name(model, root)}' hangs on the joints {names}: here it floats")
+        tree.say(f"body '{_name(model, root)}' hangs on the joints {names} in the file, but floats in the model")
     return root
 
 
@@ -236,8 +238,8 @@ def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> No
 
 
 def _smaller(limits: np.ndarray) -> float | None:
-    """Return the size of the limit that is nearer to 0, or of the other limit if that one is 0. Return None if the result is
-    0 or too large.
+    """Return the smaller absolute value of the two `limits`, or the larger one if the smaller one is 0. Return None if the
+    result is 0 or too large.
     """
     size = float(min(abs(limits[0]), abs(limits[1])) or max(abs(limits[0]), abs(limits[1])))
     return size if 0.0 < size < 1e5 else None
@@ -288,7 +290,7 @@ def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
 
 
 def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int, Mesh]:
-    """Return id -> mesh of a model. A mesh has a file, or vertices if the MJCF itself states or moves them."""
+    """Return id -> mesh of a model. A mesh has vertices if the MJCF itself states or moves them, else a file."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
@@ -354,8 +356,8 @@ def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
 
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:
-    """Return the coefficients (5,) of the polynomial that gives the first hinge's angle from the second's [rad]. MuJoCo's
-    coefficients `factors` are for angles relative to the `ref` of each joint, `first` and `second`.
+    """Return the coefficients (5,) of the polynomial that gives the first hinge's angle from the second's [rad]. `first`
+    and `second` are the joints' `ref` angles [rad]. MuJoCo's coefficients `factors` are for angles relative to these.
     """
     polynomial = first + np.polynomial.Polynomial(factors)(np.polynomial.Polynomial([-second, 1.0]))
     return np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))

@@ -7,12 +7,12 @@ from legged.robots.importing.tree import Hinge, Tree
 
 ON_JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 MOST = 1e5
-"""Larger torques [N m] and gains [N m/rad] count as missing."""
+"""Torques [N m] and gains [N m/rad] above this value count as missing."""
 
 
 def read_motors(model: mujoco.MjModel, tree: Tree) -> None:
-    """Set the torque limits and gains of the hinges that have actuators, at the joint (after the gear), and mark these hinges
-    as driven. In a file without actuators, all hinges are driven.
+    """Set the torque limits and gains of the hinges that have actuators, and mark these hinges as driven. The values are
+    those at the joint, after the gear. In a file without actuators, all hinges are driven.
     """
     hinges = {hinge.name: hinge for hinge in tree.hinges}
     for i in range(model.nu):
@@ -42,7 +42,7 @@ def _read_actuator(model: mujoco.MjModel, i: int, hinge: Hinge) -> None:
     limits = []
     if model.actuator_forcelimited[i]:
         limits.append(np.abs(model.actuator_forcerange[i] * gear))
-    if fixed and not affine and model.actuator_ctrllimited[i]:  # a motor, whose control is a force
+    if fixed and not affine and model.actuator_ctrllimited[i]:  # the actuator is a motor: its control is a force
         limits.append(np.abs(model.actuator_ctrlrange[i] * gain[0] * gear))
     if affine and fixed:
         stiffness, damping = -float(bias[1]) * gear**2, -float(bias[2]) * gear**2

@@ -11,19 +11,19 @@ from legged.errors import ConfigError
 from legged.robots.importing.meshes import ignoring_case
 
 SETTINGS = ("option", "flag", "compiler", "size", "statistic", "global", "quality", "headlight", "map", "scale", "rgba")
-"""Elements whose attributes may be left out: the task has settings of its own."""
+"""Elements whose unknown attributes are left out, because the task has settings of its own."""
 UNKNOWN = re.compile(r"unrecognized attribute: '([^']+)'\s+Element '([^']+)'")
 """MuJoCo's error about an unknown attribute. Its groups are the names of the attribute and of the element."""
 
 Said = list[tuple[str, str]]
-"""Lines about changes, each with the name of the thing that was changed."""
+"""Messages about changes, each with the name of the thing that was changed."""
 
 
 def read_spec(path: Path) -> tuple[mujoco.MjSpec, Said]:
-    """Parse an MJCF file; return the spec, and lines about what was changed to make MuJoCo accept it.
+    """Parse an MJCF file. Return the spec, and messages about changes that were made so that MuJoCo accepts the file.
 
     Raises:
-        ConfigError: MuJoCo refuses it.
+        ConfigError: MuJoCo refuses the file.
     """
     said: Said = []
     try:
@@ -36,7 +36,7 @@ def read_spec(path: Path) -> tuple[mujoco.MjSpec, Said]:
     for mesh in (mesh for mesh in spec.meshes if mesh.file and not (folder / mesh.file).is_file()):
         found = ignoring_case(folder / mesh.file)
         if found is not None and found.is_file():
-            said.append(("mesh files are found only in other upper and lower case", f"{mesh.file} -> {found.name}"))
+            said.append(("mesh files are found under names with other upper and lower case", f"{mesh.file} -> {found.name}"))
             mesh.name, mesh.file = mesh.name or Path(mesh.file).stem, os.path.relpath(found, folder)
     return spec, said
 

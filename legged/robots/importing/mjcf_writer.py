@@ -16,13 +16,13 @@ DRAWN_GROUP, TOUCHED_GROUP = 2, 3
 """Groups of visual and of collision geoms. Pictures show only the visual ones."""
 GREY = "0.7 0.7 0.72 1"
 DRAWN_APART = 1e-6
-"""Largest distance between the two points of a constraint at zero joint angles [m]. If it is larger, sites are needed."""
+"""A constraint needs sites if its two points are farther apart than this at zero joint angles [m]."""
 
 
 def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float = 0.0, remarks: Sequence[str] = ()) -> str:
     """Return a tree as MJCF.
 
-    `files` maps the names of visual meshes to their files; meshes that it does not name are left out. The base is at `height`
+    `files` maps the names of visual meshes to their files; visual meshes without a file are left out. The base is at `height`
     [m]; `remarks` are comments at the top.
     """
     files = files or {}
@@ -66,10 +66,10 @@ def mjcf_of(tree: Tree, files: Mapping[str, Path] | None = None, height: float =
 
 
 def model_of(tree: Tree) -> mujoco.MjModel:
-    """Return the compiled model of a tree without visual meshes.
+    """Return the compiled model of a tree; visual meshes are left out.
 
     Raises:
-        ConfigError: MuJoCo refuses it.
+        ConfigError: MuJoCo refuses the model.
     """
     try:
         return mujoco.MjModel.from_xml_string(mjcf_of(tree))

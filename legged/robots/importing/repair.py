@@ -115,7 +115,7 @@ def _hold_followers(tree: Tree, at: Mapping[str, float]) -> None:
 
 
 def rest_angle(tree: Tree, hinge: Hinge) -> float:
-    """Return the angle [rad] at which a joint is held: the keyframe's, else 0, clipped to the joint's range."""
+    """Return the angle [rad] at which a joint is held: its angle in the keyframe, else 0, clipped to its range."""
     return float(np.clip((tree.home or {}).get(hinge.name, 0.0), *(hinge.range or (-np.inf, np.inf))))
 
 
@@ -186,7 +186,7 @@ def _parents_first(tree: Tree) -> None:
 
 
 def _give_mass(tree: Tree) -> None:
-    """Give each massless link that carries others a share of its heaviest child's mass; the sum stays the same."""
+    """Move a share of the heaviest child's mass to each link without mass. The total mass stays the same."""
     for i in reversed(range(1, len(tree.links))):
         link = tree.links[i]
         if link.mass > TINY:
@@ -203,7 +203,7 @@ def _give_mass(tree: Tree) -> None:
 
 
 def _mend_inertia(link: Link, tree: Tree) -> None:
-    """Make the principal moments of a link positive, and none larger than the sum of the other two, as for any real body."""
+    """Correct a link's principal moments: as in any real body, each must be positive and at most the sum of the other two."""
     if np.abs(link.inertia).max() < TINY * max(1.0, link.mass):
         sides = _extent([shape for shape in link.shapes if shape.collides] or link.shapes)
         if sides is None:
@@ -218,11 +218,11 @@ def _mend_inertia(link: Link, tree: Tree) -> None:
     excess = max(0.0, wanted[2] - wanted[0] - wanted[1])
     if moments[0] > 0.0 and wanted[0] + wanted[1] >= wanted[2] * (1.0 + ROUNDING):
         return
-    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # a flat body whose rounded moments break the limit slightly
+    if excess < ROUNDING * wanted[2] and moments[0] > 0.0:  # rounding of a flat body's moments may break A + B >= C
         link.inertia = axes @ np.diag(wanted + np.array([1.0, 1.0, 0.0]) * ROUNDING * wanted[2]) @ axes.T
         return
     said = ", ".join(f"{moment:.3g}" for moment in moments)
-    why = "is not above 0" if moments[0] <= 0.0 else f"breaks A + B >= C by {excess / wanted[2]:.1%}"
+    why = "has a moment that is not above 0" if moments[0] <= 0.0 else f"breaks A + B >= C by {excess / wanted[2]:.1%}"
     wanted[:2] += excess / 2.0 + ROUNDING * wanted[2]
     link.inertia = axes @ np.diag(wanted) @ axes.T
     now = ", ".join(f"{moment:.3g}" for moment in wanted)

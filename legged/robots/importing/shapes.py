@@ -10,11 +10,13 @@ from legged.robots.importing.tree import Shape, Tree
 from legged.robots.reserved_names import RESERVED
 
 THINNEST = 0.02
-"""Smallest half length of a guessed trunk, as a share of the largest one allowed."""
+"""Smallest half length of a guessed trunk box, as a share of the largest half length allowed."""
 
 
 def fit_meshes(tree: Tree) -> None:
-    """Replace the collision meshes of a tree by primitives, in place. If no shape collides, copies of visual shapes do."""
+    """Replace the collision meshes of a tree by primitives, in place. If no shape collides, collision copies of the visual
+    shapes are added first.
+    """
     if not tree.shapes:
         _let_the_drawn_collide(tree)
     for link in tree.links:
@@ -50,7 +52,7 @@ def _let_the_drawn_collide(tree: Tree) -> None:
 
 
 def give_trunk(tree: Tree, widest: float) -> None:
-    """Add to the base a collision box with the base's inertia. Its half lengths are at most `widest` [m]."""
+    """Add to the base a collision box with the base's inertia. The box's half lengths are at most `widest` [m]."""
     base = tree.links[0]
     moments, axes = np.linalg.eigh(base.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
@@ -64,7 +66,7 @@ def give_trunk(tree: Tree, widest: float) -> None:
 
 
 def name_shapes(tree: Tree) -> None:
-    """Give each collision shape a unique name that the scene does not need: its own name, else the name of its link."""
+    """Give each collision shape a unique name that is not reserved for the scene: its own name, else the name of its link."""
     taken: set[str] = set()
     shapes = sorted(tree.shapes, key=lambda shape: not shape.name)  # named shapes come first and keep their names
     for shape in shapes:

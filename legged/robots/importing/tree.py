@@ -32,12 +32,12 @@ class Shape:
     kind: str
     """sphere, capsule, cylinder, box, ellipsoid or mesh."""
     size: Vector
-    """(3,) as in MuJoCo: radius; radius and half length; half lengths [m]."""
+    """(3,) as in MuJoCo [m]: radius of a sphere, radius and half length of a capsule or cylinder, else three half lengths."""
     pos: Vector
     quat: Vector
     collides: bool
     link: str
-    """Link of the shape in the file, which may have been merged into another link since."""
+    """Name of the shape's link in the file. This link may have been merged into another link since."""
     name: str = ""
     mesh: Mesh | None = None
     rgba: Vector | None = None
@@ -48,7 +48,7 @@ class Shape:
     """(V, 3) vertices of the mesh that a collision shape was fitted to [m]."""
 
     def move(self, pos: Vector, quat: Vector) -> None:
-        """Move the shape into another frame, in which its present frame is at `pos` (3,) [m], turned by `quat` (4,)."""
+        """Express the shape in another frame, where its present frame is at `pos` (3,) [m] and is turned by `quat` (4,)."""
         self.pos, self.quat = pos + rotate(quat, self.pos), quat_product(quat, self.quat)
         self.points = None if self.points is None else pos + rotate(quat, self.points)
         self.fits = {
@@ -85,7 +85,7 @@ class Hinge:
 
 @dataclass
 class Link:
-    """A rigid body. Its pose is in the frame of the parent at joint angles 0; mass and inertia are in its own frame."""
+    """A rigid body. Its pose is in the parent's frame at joint angles 0; `com` and `inertia` are in its own frame."""
 
     name: str
     parent: int
@@ -113,17 +113,17 @@ class Tree:
     home: dict[str, float] | None = None
     """Joint angles of a keyframe [rad]."""
     home_name: str = ""
-    """Name of that keyframe."""
+    """Name of the keyframe with the angles `home`."""
     loops: list[dict[str, str]] = field(default_factory=list)
-    """Equality constraints: their kind, as `tag`, and their MJCF attributes. A `connect` also has `anchor2`, the point in the
-    frame of body2 that `anchor` is tied to [m].
+    """Equality constraints. Each has its kind as `tag`, and MJCF attributes. A `connect` also has `anchor2` [m]: the point in
+    the frame of body2 to which `anchor` is tied.
     """
     apart: set[tuple[str, str]] = field(default_factory=set)
-    """Pairs of links that do not collide, whatever their shapes allow."""
+    """Pairs of links that never collide with each other."""
     _said: dict[str, list[str]] = field(default_factory=dict)
 
     def say(self, line: str, about: str = "") -> None:
-        """Record a line for the user. Lines with the same text become one line, which lists all their `about`."""
+        """Record a line for the user. Lines with the same text become one line, which lists all values of `about`."""
         names = self._said.setdefault(line, [])
         if about and about not in names:
             names.append(about)
@@ -184,8 +184,8 @@ class Tree:
 
 
 def turn_link(link: Link, hinge: Hinge, angle: float) -> None:
-    """Give a link, at zero angles, the pose that it has when `hinge` is at `angle` [rad]. Earlier hinges
-    of the link stay where they are; their axes and anchors are expressed in the turned frame.
+    """Turn a link by `angle` [rad] about one of its hinges. The turned pose becomes the link's pose at zero angles. Earlier
+    hinges of the link do not move, but their axes and anchors are expressed in the turned frame.
     """
     turn = quat_about(hinge.axis, angle)
     shift, back = hinge.anchor - rotate(turn, hinge.anchor), inverse(turn)
@@ -253,7 +253,7 @@ def inverse(quat: Vector) -> Vector:
 
 
 def add_mass(link: Link, mass: float, com: Vector, inertia: Vector) -> None:
-    """Add to `link` a `mass` [kg] with the centre `com` (3,) [m] and the `inertia` (3, 3) about this centre, link frame."""
+    """Add to `link` a `mass` [kg] at `com` (3,) [m] with `inertia` (3, 3) [kg m^2] about `com`, both in the link's frame."""
     total = link.mass + mass
     if total <= 0.0:
         return
@@ -265,5 +265,5 @@ def add_mass(link: Link, mass: float, com: Vector, inertia: Vector) -> None:
 
 
 def _point(mass: float, at: Vector) -> Vector:
-    """Return the inertia (3, 3) about the origin of a point mass at `at` (3,)."""
+    """Return the inertia (3, 3) of a point mass at `at` (3,), taken about the origin of the frame."""
     return mass * (at @ at * np.eye(3) - np.outer(at, at))

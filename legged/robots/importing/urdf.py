@@ -78,7 +78,7 @@ def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tre
 def _parsed(path: Path) -> ET.Element:
     """Return the root element of the file."""
     try:
-        text = path.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")  # some files have blanks before the declaration
+        text = path.read_bytes().lstrip(b"\xef\xbb\xbf \t\r\n")  # some files have blanks before the XML declaration
         root = ET.fromstring(text)
     except ET.ParseError as error:
         raise ConfigError(f"{path}: is not well-formed XML: {error}") from error
@@ -90,7 +90,7 @@ def _parsed(path: Path) -> ET.Element:
         "${" in value for element in root.iter() for value in element.attrib.values()
     ):
         plain = f"{path.name.split('.')[0]}.plain.urdf"
-        raise ConfigError(f"{path}: is a xacro file; write the URDF first: xacro {path.name} > {plain}")
+        raise ConfigError(f"{path}: is a xacro file; write the URDF first with `xacro {path.name} > {plain}`")
     if root.find("link") is None:
         raise ConfigError(f"{path}: has no links")
     return root
@@ -99,8 +99,8 @@ def _parsed(path: Path) -> ET.Element:
 def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) -> tuple[str, list["_Joint"]]:
     """Return the base link, and the joints above it.
 
-    The base is the link that is no joint's child. If it is empty and carries a single link on a fixed or floating joint, like
-    `world` or `base_footprint`, it is removed with the joint, and the link that it carries is the base.
+    The base is the link that is no joint's child. If this link is empty, like `world` or `base_footprint`, and carries one
+    link on a fixed or floating joint, the empty link and the joint are removed. The carried link is then the base.
     """
     children = [joint.child for joint in joints]
     twice = next((name for name in children if children.count(name) > 1), None)
@@ -152,7 +152,7 @@ def _check_degrees(tree: Tree) -> None:
 
 
 def _say_what_is_unknown(tree: Tree, root: ET.Element) -> None:
-    """Report the elements of the robot and of its joints that are left out."""
+    """Report which elements of the robot and which elements of its joints are left out."""
     left_out = [element.tag for element in root if element.tag not in ("link", "joint", "material")]
     left_out += [part.tag for joint in root.findall("joint") for part in joint if part.tag not in PARTS]
     for tag in dict.fromkeys(tag for tag in left_out if isinstance(tag, str)):

@@ -1,4 +1,6 @@
-"""Wheels: end links on hinges without limits, with shapes that are round about the hinge's axis. Meshes become cylinders."""
+"""Detection of wheels. A wheel is the last link of a chain, on a hinge without limits, with shapes that are round about the
+hinge's axis. Round meshes of wheels become cylinders.
+"""
 
 import re
 from dataclasses import replace
