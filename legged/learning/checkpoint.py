@@ -19,6 +19,7 @@ from legged.config.networks import NETWORKS, groups_of
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.recurrent import rnn_of
+from legged.learning.run_folder import FROM_LEGGED_GYM
 from legged.process.paths import relative, write_bytes
 from legged.robots.robot import load_robot
 
@@ -69,6 +70,8 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     """
     saved = load_plain(path, device)
     name = relative(path)
+    if isinstance(saved, dict) and "model_state_dict" in saved:
+        raise ConfigError(f"{name}: a checkpoint of rsl-rl before 5.0; {FROM_LEGGED_GYM}")
     if not isinstance(saved, dict) or not {"actor_state_dict", "iter"} <= saved.keys():
         raise ConfigError(f"{name}: not a checkpoint of rsl-rl (it lacks actor_state_dict or iter)")
     infos = {} if saved.get("infos") is None else saved["infos"]

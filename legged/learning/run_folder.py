@@ -29,6 +29,7 @@ SHIPPED_MODEL = "model.pt"
 BEST_MODEL = "model_best.pt"
 BEST = "best"
 """Value of --checkpoint that selects the best model."""
+FROM_LEGGED_GYM = "docs/migrating.md (A trained policy) tells how policies of legged_gym are evaluated here"
 GIT_S = 30.0
 """Time limit for git, which can be slow on a network disk [s]."""
 
@@ -192,7 +193,10 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
                 return max(runs, key=_last_saved)
     known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
     if exists(Path(name)) and Path(name).is_dir():
-        raise ConfigError(f"{where}: {shown(name)} holds no run: there is no {CONFIG_FILE} in it or in its folders")
+        remedy = f"; {FROM_LEGGED_GYM}" if checkpoints(Path(name)) else ""
+        raise ConfigError(f"{where}: {shown(name)} holds no run: there is no {CONFIG_FILE} in it or in its folders{remedy}")
+    if exists(Path(name)) and name.endswith(".pt"):
+        raise ConfigError(f"{where}: {shown(name)} is a file; name the folder of the run; {FROM_LEGGED_GYM}")
     raise ConfigError(f"{where}: there is no task and no run {shown(name)}{suggest(name[:100], [*task_names(), *known])}")
 
 
@@ -273,7 +277,8 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
-        raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE})")
+        remedy = f"; {FROM_LEGGED_GYM}" if checkpoints(folder) else ""
+        raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE}){remedy}")
     data = read_yaml(path)
     actuator_path(data, folder)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))

@@ -184,6 +184,23 @@ def test_an_archive_of_something_else_is_refused(model):
         read_checkpoint(model)
 
 
+def test_runs_of_legged_gym_are_named_and_their_policies_have_a_way_in(tmp_path, monkeypatch, capsys):
+    """As its rsl-rl and its play.py write them."""
+    monkeypatch.chdir(tmp_path)
+    run = Path("old/Sep30_12-00-00_")
+    run.mkdir(parents=True)
+    weights = {"std": torch.ones(12), "actor.0.weight": torch.zeros(12, 48), "critic.0.weight": torch.zeros(1, 48)}
+    torch.save({"model_state_dict": weights, "optimizer_state_dict": {}, "iter": 300, "infos": None}, run / "model_300.pt")
+    torch.jit.script(torch.nn.Linear(48, 12)).save("policy_1.pt")
+    for name, what in (("old", "no config.yaml"), (str(run), "no config.yaml"), ("policy_1.pt", "is a file")):
+        assert call(play.main, [name, "--sim_device", "cpu"]) == 2
+        err = capsys.readouterr().err
+        assert what in err
+        assert "docs/migrating.md" in err
+    with pytest.raises(ConfigError, match=r"model_300\.pt: a checkpoint of rsl-rl before 5\.0; docs/migrating\.md"):
+        read_checkpoint(run / "model_300.pt")
+
+
 def test_a_folder_of_that_name_is_said(tmp_path):
     (tmp_path / "model_3.pt").mkdir()
     with pytest.raises(ConfigError, match=r"model_3\.pt: cannot be read \(Is a directory\)"):
