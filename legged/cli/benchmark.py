@@ -122,7 +122,6 @@ def _measure(
 
 
 def _add_memory(result: dict[str, Any], device: torch.device) -> None:
-    """Add the GPU memory in use to a result."""
     if device.type == "cuda":
         free, whole = torch.cuda.mem_get_info(device)
         result["gpu_memory_gib"] = (whole - free) / 2**30
@@ -142,7 +141,6 @@ def _last_line(text: str, code: int) -> str:
 
 
 def _write(args: argparse.Namespace, result: Any) -> None:
-    """Write a result into the folder of --out, if one was given."""
     if args.out is not None:
         write_result(args.out / RESULT, result)
 

@@ -41,6 +41,5 @@ def robots() -> dict[str, str]:
 
 
 def _comment(path: Path) -> str:
-    """Return the comment at the head of a YAML file, as one line."""
     lines = takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
     return " ".join(line.lstrip("# ") for line in lines)

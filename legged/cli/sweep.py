@@ -191,7 +191,6 @@ class Worker:
         return [*stopped_by, *in_trials]
 
     def _stop(self) -> None:
-        """Begin no further trial."""
         self._stopped = True
 
     def _make(self, trial: "Trial") -> None:

@@ -286,7 +286,6 @@ class _Training:
         runner.logger.hand_over(runner.current_learning_iteration)
 
     def _report(self, folder: Path, film: bool) -> None:
-        """Write the report on a training that has ended, unless its configuration switches reports off."""
         if self.cfg.train.runner.report:
             from legged.evaluation.reports.run_report import report_at_end  # imported late; training does not need it
 

@@ -186,7 +186,6 @@ def known_failure(error: BaseException) -> str | None:
 
 
 def _say(text: str) -> None:
-    """Print the reason why the command ends."""
     try:
         rank = f"rank {Ranks.now().rank}: " if Ranks.now().several else ""
     except ConfigError:  # the rank in the environment is invalid; `text` must be printed without it

@@ -133,7 +133,6 @@ def _randomisation(task: BaseTask) -> Iterator[str]:
 
 
 def _span(span: tuple[float, float], unit: str) -> str:
-    """Return a range with its unit."""
     return f"{_number(span[0])} to {_number(span[1])}{'' if unit == '1' else f' {unit}'}"
 
 

@@ -185,7 +185,6 @@ class Program:
         return f"the robot does not stand: {joint} is {away.max():.2f} rad from its default (allowed: {STANDS_WITHIN:g})"
 
     def _stop(self, reason: str, now: float) -> None:
-        """Enter the state `stop` and report the reason."""
         if self.state is not State.STOP:
             self.stops += (reason,)
             self._say(f"stop: {reason}", now)

@@ -176,7 +176,6 @@ def tables_of(found: Mapping[str, JointStatistics]) -> dict[str, Table]:
 
 
 def _measured(found: Mapping[str, JointStatistics]) -> list[tuple[str, str]]:
-    """Return name and title of the quantities that all policies have."""
     return [(name, title) for name, title in MEASURED if all(name in one.mean for one in found.values())]
 
 

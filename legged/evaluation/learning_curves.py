@@ -204,7 +204,6 @@ def _tags(runs: Named, beginning: str) -> list[str]:
 
 
 def _several(tags: Sequence[str], runs: Named, **how: Any) -> list[Chart]:
-    """Return a chart for each of the `tags` that at least one run logged."""
     names = {tag: "evaluated: " * tag.startswith(WATCHED) + tag.partition("/")[2].replace("_", " ") for tag in tags}
     titles = {tag: TITLES.get(tag, (name, 1.0)) for tag, name in names.items()}
     return [chart for tag, (title, factor) in titles.items() for chart in _one(tag, title, runs, factor, **how)]

@@ -260,7 +260,6 @@ def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]
 
 
 def _recurrent(result: Translation) -> None:
-    """Map the settings of a recurrent policy."""
     kind = result.theirs.get("runner.policy_class_name")
     if kind is not None and "Recurrent" in str(kind.value):
         result.done.add("runner.policy_class_name")

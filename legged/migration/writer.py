@@ -33,7 +33,6 @@ def robot_yaml(head: Sequence[str], entries: Mapping[str, Any]) -> str:
 
 
 def _text(key: str, value: Any) -> str:
-    """Return an entry as YAML. A value that is not a mapping is written on one line."""
     if isinstance(value, dict):
         return dump({key: value}, default_flow_style=None, width=WIDTH, sort_keys=False)
     return f"{key}: {dump(value, default_flow_style=True, width=10**9)}".removesuffix("...\n")

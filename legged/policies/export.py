@@ -161,14 +161,12 @@ def _by_onnx(content: bytes, observations: Tensor, begins: Tensor, memory: dict[
 
 
 def _by_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndarray:
-    """Return the actions of the file of weights."""
     network = NumpyNetwork(content)
     network.run(observations[0].numpy())
     return _actions(lambda step: network.run(step.numpy()), lambda new: network.restart(new.numpy()), observations, begins)
 
 
 def _torchscript(policy: Any) -> bytes:
-    """Return the TorchScript file of a policy."""
     buffer = io.BytesIO()
     torch.jit.save(torch.jit.script(policy.as_jit().to("cpu")), buffer)
     return buffer.getvalue()
@@ -231,7 +229,6 @@ def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> l
 
 
 def _recurrent(module: nn.LSTM | nn.GRU) -> list[Layer]:
-    """Return the layers of a recurrent module in order."""
     kind, layers = kinds.LSTM if isinstance(module, nn.LSTM) else kinds.GRU, []
     for i in range(module.num_layers):
         names = (f"weight_ih_l{i}", f"weight_hh_l{i}", f"bias_ih_l{i}", f"bias_hh_l{i}")

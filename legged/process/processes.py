@@ -133,7 +133,6 @@ class WorkerPool:
         return not (job.kind in self.shared and trainings)
 
     def _end_at_once(self) -> None:
-        """End all running jobs before this process ends."""
         for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):
             for job in self.running:
                 job.tell(number)

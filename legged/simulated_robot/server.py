@@ -132,12 +132,10 @@ class Server:
                     self._newest, self.robot.asked, self._told = sequence, asked, self.robot.data.time
 
     def _send_state(self, now: float, sources: dict[str, np.ndarray | None]) -> None:
-        """Queue a state for sending."""
         self._sequence += 1
         self._out.put(now, udp.packet(udp.STATE, self._sequence, udp.pack_state(self.robot.state(sources))))
 
     def _deliver(self, now: float) -> None:
-        """Send the packets whose latency has passed."""
         for data in self._out.take(now):
             if self._client is not None:
                 with suppress(OSError):  # the client may have closed its socket

@@ -286,7 +286,6 @@ def _parameter(key: str, one: ParameterConfig, cfg: TaskConfig, path: Path) -> P
 
 
 def _try(key: str, values: Iterable[Any], cfg: TaskConfig, path: Path) -> None:
-    """Check the configuration with each value."""
     with _said_in(path, "parameters"):
         for value in values:
             task_class(cfg.task).check(override(cfg, [(key, value)]))

@@ -355,7 +355,6 @@ def _why_no_value(plan: Plan, trial: "FrozenTrial") -> str:
 
 
 def _text(value: Any) -> str:
-    """Return a value with all its digits, as in a YAML file."""
     return value if isinstance(value, str) else json.dumps(value)
 
 

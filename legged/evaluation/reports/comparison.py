@@ -291,7 +291,6 @@ def _table(names: Sequence[str], results: Sequence[dict[str, Any] | None]) -> Ta
 
 
 def _text(measured: Measured, form: str, factor: float) -> str:
-    """Return a figure as text, with its interval in brackets."""
     if measured is None:
         return "-"
     value, interval = measured

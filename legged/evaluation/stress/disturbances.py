@@ -199,7 +199,6 @@ class StressedTask(LeggedRobot):
         self.reset()
 
     def _per_robot(self, name: str) -> Tensor:
-        """Return the field `name` of each robot's disturbance as a tensor (N,)."""
         values = [float(getattr(row, name)) for row in self.rows]
         return torch.tensor(values, dtype=torch.float32, device=torch.device(self.device))
 

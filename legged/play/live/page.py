@@ -179,7 +179,6 @@ class Page:
             self._do(push.on_click, all_or_one)
 
     def _steer(self, change: Callable[[], object]) -> None:
-        """Change the command by calling `change`, and move the sliders to the new command."""
         change()
         for axis, slider in self.sliders:
             slider.value = round(self.session.command[axis], 3)

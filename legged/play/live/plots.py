@@ -141,7 +141,6 @@ class LivePlots:
 
 
 def _line(name: str, color: str, dash: tuple[int, int] | None = None) -> dict[str, Any]:
-    """Return uPlot's options for a curve."""
     return {"label": name, "stroke": color, "width": 1.6, **({"dash": dash} if dash else {})}
 
 
