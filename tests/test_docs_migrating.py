@@ -60,7 +60,7 @@ def test_the_class_that_was_ported_trains():
 
 
 def test_rewards_are_the_same_lines_before_and_after():
-    before, after = [text for language, text in fenced(PAGE) if language == "python"]
+    before, after, _ = [text for language, text in fenced(PAGE) if language == "python"]
 
     def rewards(text: str) -> list[str]:
         return re.findall(r"    def _reward_\w+\(self\):\n(?:        .*\n)+", text)
