@@ -1,4 +1,4 @@
-"""Physics of a task with randomised properties, and changes of these properties within steps."""
+"""Physics of a task with randomised properties, which can be drawn anew during a step."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

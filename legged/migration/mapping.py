@@ -282,7 +282,7 @@ def _random_model(result: Translation) -> None:
                 result.done -= {path} - {entry.setting for entry in result.lost}
                 continue
             result.done.add(switch)
-            # Here an offset is added to the measured angle. Forks add it to the target, so the sign changes.
+            # This package adds an offset to the measured angle. Forks add it to the target, so the sign changes.
             pair = [0 - pair[1], 0 - pair[0]] if ours == "joint_offset" else pair
             for field in ours.split():
                 result.put(field if "." in field else f"domain_rand.ranges.{field}", pair, path)

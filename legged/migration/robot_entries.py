@@ -37,8 +37,8 @@ def names_of(result: Translation) -> list[str]:
 
 
 def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
-    """Set the task's gains, and return entries of robot.yaml: those that differ from the entries of `robot`, or all if
-    `robot` is None.
+    """Translate the fork's settings of the robot. Gains go to `result`; the others are returned as entries of a robot.yaml:
+    those that differ from `robot`, or all if `robot` is None.
     """
     gains = {name: result.get(f"control.{name}", {}) for name in ("stiffness", "damping")}
     if result.get("control.use_actuator_network", False) or result.get("control.control_type") == "actuator_net":

@@ -98,7 +98,7 @@ class Parameter:
         return min(max(float(f"{drawn:.4g}"), self.distribution.low), self.distribution.high)
 
     def drawn(self, value: Any) -> Any:
-        """Return the number or text that Optuna would sample for a value of the setting; None if the value is not tried."""
+        """Return the number or text that Optuna samples for this value of the setting; None if the sweep cannot sample it."""
         if hasattr(self.distribution, "choices"):
             return next((text for text in self.distribution.choices if json.loads(text) == value), None)
         if isinstance(value, bool) or not isinstance(value, int | float):

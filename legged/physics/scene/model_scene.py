@@ -28,7 +28,7 @@ class ModelScene(Scene):
         """
         try:
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", ".* is deprecated")  # files with deprecated elements still work
+                warnings.filterwarnings("ignore", ".* is deprecated")  # MuJoCo still reads deprecated elements
                 spec = mujoco.MjSpec.from_file(str(self.path))
                 set_options(spec.option, sim)
                 model = spec.compile()

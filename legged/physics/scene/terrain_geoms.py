@@ -171,8 +171,8 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
     for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     for sloped in _layers(corners, ~flat):
-        # Slopes among steps have no skin, because it would stick out next to vertical faces. Points that no slope uses are
-        # sunk to the floor, so that the surface that leads down to them lies inside the boxes.
+        # Height fields among boxes have no `skin`, because they would stick out of vertical faces. Points that belong to no
+        # sloped cell are lowered to the floor: the field then falls steeply inside the neighbouring boxes.
         i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(sloped))
         points = _lattice(corners[i, j], sloped[i, j])[0]
         add.surface(x.start + i.start, y.start + j.start, np.where(np.isnan(points), add.floor, points))

@@ -195,7 +195,7 @@ class Page:
         self.refresh()
 
     def _add_keys(self) -> None:
-        """Add keys for the actions of buttons and for the command. Viser's command palette lists the keys."""
+        """Add keys for pause, single step, reset and the velocity command. Viser's command palette lists them."""
         session = self.session
 
         def press(axis: int, change: float) -> None:
