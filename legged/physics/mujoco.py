@@ -51,7 +51,7 @@ class MujocoPhysics(Physics):
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)
-        # By default MuJoCo silently resets a state that diverges. Here it must stay non-finite, so that the task sees it.
+        # MuJoCo silently resets a diverged state by default. This flag lets the state stay non-finite, and the task sees it.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Constraint islands gain nothing, because a world holds one robot. Finding them costs 6 % of a step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND

@@ -155,8 +155,8 @@ class Robot:
 
 
 def load_robot(name: str, where: str = "robot") -> Robot:
-    """Return the robot in resources/robots/`name` or, if there is none, in the folder with the path `name`. `where` is the
-    place of the name in the configuration, for error messages.
+    """Return the robot in resources/robots/`name` or, without such a folder, in the folder with the path `name`. `where` is
+    the place of the name in the configuration, for error messages.
 
     Raises:
         ConfigError: there is no such robot, or robot.yaml and the model contradict each other.

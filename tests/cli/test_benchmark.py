@@ -70,7 +70,7 @@ def test_mujoco_warps_own_step_is_timed_beside_ours():
 def test_why_a_step_is_mujoco_warps_own_is_said():
     task = make_task(small_config(("sim.physics", "mujoco_warp"), ("sim.step", "library"), num_envs=2))
     text = report(task, time_steps(task, 1, 1) | {"build_s": 0.0})
-    assert "  uses mujoco-warp's own launches; reason: sim.step=library\n" in text
+    assert "  part of the step uses mujoco-warp's own launches: sim.step=library\n" in text
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ def test_a_default_pose_that_leans_to_a_side_has_no_mirror_images(added):
     before = robot.read_text()
     robot.write_text(before.replace("hip: 0", "hip: 0.1"))
     assert robot.read_text() != before
-    with pytest.raises(ConfigError, match=r"symmetry: the default_joint_angles of 'leaning_toy'"):
+    with pytest.raises(ConfigError, match=r"symmetry: left and right default_joint_angles of 'leaning_toy'"):
         task_config(task, on_cpu=True)
     task_config(task, [("train.algorithm.symmetry", False)], on_cpu=True)
     robot.write_text(before.replace("hip: 0", "fl_hip: 0.1\n  hl_hip: 0.1\n  fr_hip: -0.1\n  hr_hip: -0.1"))
@@ -177,7 +177,7 @@ def test_a_shank_whose_mesh_has_the_foot_in_it_ends_above_the_foot(added, tmp_pa
     assert "end above the foot" not in untouched  # it ends at -0.18
     rods = urdf().replace(cylinder, mesh).replace('<collision><geometry><sphere radius="0.02"/></geometry></collision>', "")
     out = added(rods, "--name", "fifteenth_toy")
-    assert "a ball is added at the end of" in out
+    assert "so a ball is added as the foot" in out
     assert "end above the foot" not in out  # the rod was drawn back once already
 
 

@@ -319,7 +319,7 @@ def test_a_file_with_the_name_of_a_loaded_module_does_not_replace_it(error):
     ("config", "words"),
     [
         ("{'extends': 'nothing_like'}", "registered config of 'mine': extends: there is no task or file 'nothing_like'"),
-        (f"{{'extends': '{TASK}', 'custom': {{'a': object()}}}}", "custom.a: expected numbers, texts"),
+        (f"{{'extends': '{TASK}', 'custom': {{'a': object()}}}}", "custom.a: expected a number, a text"),
         (f"{{'extends': '{TASK}', 'env': {{1: 2}}}}", "env.1: unknown key 1"),
         ("'nowhere.yaml'", "nowhere.yaml: cannot be read"),
         ("''", "cannot be read (Is a directory)"),

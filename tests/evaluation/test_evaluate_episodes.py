@@ -173,8 +173,8 @@ def test_a_policy_for_something_else_is_refused(changes, name, words, tmp_path):
 @pytest.mark.parametrize(
     ("command", "arguments", "words"),
     [
-        (grid, [TASK, "--vx=0"], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
-        (checkpoints, [TASK], f"POLICY: '{TASK}' has no velocity commands; legged evaluate episodes"),
+        (grid, [TASK, "--vx=0"], f"POLICY: '{TASK}' has no velocity commands; use `legged evaluate episodes"),
+        (checkpoints, [TASK], f"POLICY: '{TASK}' has no velocity commands; use `legged evaluate episodes"),
         (episodes, [TASK, "--num-envs", "3"], "--num-envs: leave it out, because the evaluation chooses"),
         (episodes, [TASK, "--episodes", "0"], "--episodes: must be at least 1, got 0"),
         (in_gymnasium, [TASK, "--episodes", "100000"], "--episodes: must be at most 65,536, got 100,000"),
@@ -182,7 +182,7 @@ def test_a_policy_for_something_else_is_refused(changes, name, words, tmp_path):
         (in_gymnasium, [TASK, "--physics", "mujoco"], "--physics: leave it out, because Gymnasium simulates the robots"),
         (in_gymnasium, [TASK, "--sim-device", "cpu"], "--sim-device: leave it out, because Gymnasium simulates the robots"),
         (in_gymnasium, ["humanoid"], "'humanoid'"),
-        (episodes, ["anymal_c_flat"], "POLICY: 'anymal_c_flat' follows velocity commands; legged evaluate grid"),
+        (episodes, ["anymal_c_flat"], "POLICY: 'anymal_c_flat' follows velocity commands; use `legged evaluate grid"),
         (in_gymnasium, ["anymal_c_flat"], "'anymal_c_flat'"),
     ],
 )

@@ -111,7 +111,7 @@ def test_a_transfer_with_warmup_takes_the_policy_alone(loop, capsys):
     capsys.readouterr()
     refused = ["--task", TASK, "--transfer", str(source), "--checkpoint", "2", "--sim_device", "cpu"]
     assert call(train.main, [*refused, *TINY_TRAINING]) == 2
-    assert "train.algorithm.critic_warmup_iterations=50 would train a new value function" in capsys.readouterr().err
+    assert "train.algorithm.critic_warmup_iterations=50 trains a new value function" in capsys.readouterr().err
 
 
 @pytest.mark.slow

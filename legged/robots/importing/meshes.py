@@ -219,7 +219,7 @@ def rounded(shape: Shape) -> Shape:
 
 
 def refitted(shape: Shape, kind: str) -> Shape:
-    """Return the primitive `kind` that was fitted to the mesh of a shape, or a copy of the shape if there is none."""
+    """Return the primitive `kind` that was fitted to the mesh of a shape, or a copy of the shape if there was no fit."""
     size, pos, quat = shape.fits.get(kind, (shape.size, shape.pos, shape.quat))
     kind = kind if kind in shape.fits else shape.kind
     return replace(shape, kind=kind, size=size.copy(), pos=pos.copy(), quat=quat.copy())
