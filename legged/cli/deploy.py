@@ -268,7 +268,7 @@ def _run_both(args: argparse.Namespace, exported: Path, robot: str, folder: Path
         start_new_session=True,  # Ctrl-C must reach only the program, which stops the robot safely
     )
     program = None
-    if in_main_thread():  # SIGTERM must also end the simulated robot and the program
+    if in_main_thread():  # SIGTERM must also end the two child processes
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     try:
         assert simulator.stdout is not None

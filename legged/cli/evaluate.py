@@ -338,8 +338,8 @@ def onnx(args: argparse.Namespace) -> int:
     model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
-    With --vx, --vy or --yaw the errors over a grid of commands are measured. With --rmse the command also prints the policy
-    with the shortest training that follows the grid with at most this error and without a fall.
+    With --vx, --vy or --yaw the errors over a grid of commands are measured. With --rmse the command also prints the
+    first policy, by training time where it is known, that follows the grid with at most this error and without a fall.
     """
     grid = _grid_in(args)
     settling = grid.settle_s if grid else SETTLING_S

@@ -160,7 +160,7 @@ def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, di
     if physics.why_c_engine:
         print(f"engine: C MuJoCo, which is faster here than mujoco-warp; reason: {physics.why_c_engine}", flush=True)
     if physics.why_library:
-        print(f"physics steps use mujoco-warp's own launches, not fused kernels; reason: {physics.why_library}", flush=True)
+        print(f"part of the step uses mujoco-warp's own launches: {physics.why_library}", flush=True)
     for line in task.robot.adaptations if physics.robot_state is not None else ():
         print(f"{task.robot.file.model}: {line}", flush=True)
     if teacher is not None:

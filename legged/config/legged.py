@@ -98,7 +98,8 @@ class CommandRanges:
     lin_vel_y: Range = field(default=(-1.0, 1.0), metadata=quantity("m/s", MOTION))
     """Leftward velocity in the base frame [m/s]."""
     ang_vel_yaw: Range = field(default=(-1.0, 1.0), metadata=quantity("rad/s", MOTION))
-    """Yaw rate [rad/s]. In heading mode, the yaw rate that the heading controller commands is clipped to this range."""
+    """Yaw rate [rad/s]. In heading mode, the heading controller's yaw rate is clipped to this range, which a curriculum
+    widens."""
     heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=quantity("rad", MOTION))
     """Heading in the world frame [rad]. It is used only in heading mode."""
 

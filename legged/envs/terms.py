@@ -356,8 +356,8 @@ class Terms:
     @concurrent
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
-        """Sum of squared distances from the default angles, for joints that neither swing a leg forward nor turn a wheel,
-        such as hips that spread or turn, waist and arms [rad^2].
+        """Sum of squared distances from the default angles, for all joints except wheels and joints that swing a leg forward
+        and back. Abduction and yaw of the hips, the waist and the arms are counted [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 

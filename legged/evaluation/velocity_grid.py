@@ -117,7 +117,7 @@ def spaced(where: str, text: str, given: Sequence[float], what: str = "values", 
 
 
 def check_size(grid: Grid) -> None:
-    """Check that the robots of a grid can be simulated at once.
+    """Check that the robots of a grid can be simulated at the same time.
 
     Raises:
         ConfigError: there are no robots or too many.

@@ -81,7 +81,7 @@ class StepGraph:
         """
         self._function, self._rehearse, self._warm_up_steps = function, rehearse or function, warm_up_steps
         self._graph: torch.cuda.CUDAGraph | None = None
-        # One check is enough if the function repeats the same work. Otherwise several runs of it are compared.
+        # With `rehearse` one run is checked. Without it, the guard compares later runs with the run before them.
         self._checks = ForbidHostReads.STEPS if rehearse is None else 1
         self._guard = ForbidHostReads(device, getattr(function, "__self__", None))
         if not enabled:

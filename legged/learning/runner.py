@@ -1,4 +1,4 @@
-"""rsl-rl's OnPolicyRunner. Its checkpoints also hold the task's state and are written atomically, and it can stop cleanly."""
+"""Runner that extends rsl-rl's OnPolicyRunner with atomic checkpoints, which hold the task's state, and a clean stop."""
 
 import contextlib
 import io

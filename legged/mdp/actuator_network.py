@@ -133,7 +133,7 @@ class NetworkWeights:
             allowed = f"{self.dt:g}" if self.kind == "lstm" else f"{self.dt:g} divided by a whole number"
             raise ConfigError(
                 f"{where}: the network was trained on samples {self.dt:g} s apart. They do not fit physics steps of"
-                f" sim.dt={sim_dt:g}; sim.dt must be {allowed} (`legged fit-actuator --dt` sets the time between samples)"
+                f" sim.dt={sim_dt:g}; sim.dt must be {allowed} (`legged fit-actuator --spacing`; for an lstm, --dt)"
             )
         return steps
 

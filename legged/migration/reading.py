@@ -104,7 +104,7 @@ def read_fork(path: Path, asked: str | None) -> Fork:
 
 
 def _place(file: str, line: int) -> str:
-    """Return file and line as text; line 0 stands for a class that has no file."""
+    """Return `file:line`, or only `file` if `line` is 0."""
     return f"{relative(Path(file))}:{line}" if line else file
 
 

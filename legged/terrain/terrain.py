@@ -166,8 +166,8 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     for name, share in cfg.proportions.items():
         if share > 0.0 and name not in found:
             raise ConfigError(
-                f"{where(f'proportions.{name}')}: a share of {share:g} is less than one column, because"
-                f" {among('num_cols')}; ask for more columns or leave the type out"
+                f"{where(f'proportions.{name}')}: a share of {share:g} is less than one column"
+                f" ({among('num_cols')}); ask for more columns or leave the type out"
             )
         kind = TERRAIN_TYPES[name]
         finest = kind.finest[0] * cfg.scale if kind.finest else float("inf")

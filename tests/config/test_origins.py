@@ -123,7 +123,7 @@ def test_what_a_value_does_not_fit_is_named_too(mine):
     assert message.startswith("command line: terrain.terrain_width: a tile of 8 x 2.5 m")
     assert message.endswith(f"(proportions.slope_up: {ROUGH})")
     message = error_of(("terrain.num_rows", 10), ("terrain.num_cols", 1))
-    assert "is less than one column, because num_cols = 1 (command line)" in message
+    assert "is less than one column (num_cols = 1 (command line)" in message
 
 
 def test_a_symmetry_that_the_points_break_is_asked_for_by_one_and_broken_by_another(mine):

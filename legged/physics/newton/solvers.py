@@ -115,8 +115,8 @@ SOLVERS = {
         springs=SPRINGS,
         maximal=True,
     ),
-    # Friction acts against slip within one substep only. Without "sticky" contacts, which remember where they began, the feet
-    # slide apart within a second, whatever the numbers of substeps and iterations. With one substep the simulation diverges.
+    # Friction opposes only the slip of the current substep. "Sticky" contacts remember where they began. Without them feet
+    # slide apart within a second, for any number of substeps and iterations. With one substep the simulation diverges.
     # With 4 substeps of 8 iterations, instead of 8 substeps of 4 iterations, shapes that penetrate the ground bounce off it,
     # and walking takes six times the power.
     "xpbd": SolverSetup(

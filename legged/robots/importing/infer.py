@@ -164,7 +164,7 @@ def _soles(tree: Tree, legs: list[Leg], angles: dict[str, float], height: float)
 
 
 def _name_feet(tree: Tree, legs: list[Leg]) -> None:
-    """Rename feet whose names are part of another shape's name. A pattern in robot.yaml would match both."""
+    """Rename feet whose names are part of another shape's name. A pattern for the foot would match both."""
     for leg in legs:
         for shape in leg.feet:
             others = {other.name for other in tree.shapes if other is not shape}

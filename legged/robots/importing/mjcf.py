@@ -290,7 +290,7 @@ def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
 
 
 def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int, Mesh]:
-    """Return id -> mesh of a model. A mesh has vertices if the MJCF itself states or moves them, else a file."""
+    """Return id -> mesh of a model. A mesh has a file, or vertices if the MJCF states or moves them."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
