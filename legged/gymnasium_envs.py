@@ -255,7 +255,7 @@ class TaskEnv(gymnasium.Env):  # type: ignore[misc]
             RunError: this machine cannot render.
         """
         if self._shows_the_next and self.render_mode is not None:
-            # The task is already in the next episode. Write the old episode's final state. Only a reset can follow.
+            # The task holds the next episode's first state. Overwrite it with the old episode's final state for the picture.
             self.task.physics.write(torch.ones_like(self.task.reset_buf), self._vector.final.qpos, self._vector.final.qvel)
             self.task.sense()
             self._shows_the_next = False

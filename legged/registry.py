@@ -61,9 +61,9 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
     LeggedRobot or BaseTask; by default it is the class that the configuration names (`class:`), else the class of the task
     that it extends, else LeggedRobot.
 
-    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. Relative paths,
-    of the YAML file or in a mapping, start at the folder of the calling module. They start at the working directory if this
-    folder lacks the YAML file, or if the calling module is not a file.
+    In a configuration, `extends: anymal_c_flat` builds on a task of this package or on a registered one. A relative
+    path of a YAML file is looked for in the folder of the calling module, then in the working directory. Relative paths in a
+    mapping start at the folder of the calling module, or at the working directory if that module is not a file.
 
     Raises:
         ConfigError: the name is invalid, or the class or the configuration has a wrong type.

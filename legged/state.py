@@ -16,7 +16,7 @@ def state_of(owner: Any) -> dict[str, Tensor]:
 
 
 def load_state(owner: Any, state: Mapping[str, Any]) -> None:
-    """Copy a `state` that `state_of` returned into the tensors that `owner.STATE` names. The values may be on any device.
+    """Copy a `state` (from `state_of`) into the tensors that `owner.STATE` names. The values may be on any device.
 
     Raises:
         StateError: a tensor is missing, or has another shape or type.

@@ -48,7 +48,7 @@ KERNEL_STEPS = 20
 GROUNDS: dict[str, list[tuple[str, Any]]] = {
     "plane": [("terrain.mesh_type", "plane")],
     "terrain, our collider": [("sim.terrain_collider", "cells")],
-    # mujoco-warp's general collider needs memory for pairs of shapes that may touch, and it finds more contacts.
+    # mujoco-warp's general collider needs more memory: it stores pairs of shapes that may touch, and finds more contacts.
     "terrain, general collider": [("sim.terrain_collider", "convex"), ("sim.nconmax", 64), ("sim.njmax", 256)],
 }
 KILLED = -9
@@ -375,7 +375,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
         task.step(driver.actions)
     steps_of = {"physics": task.physics.step}
     library = task.physics.library_step
-    # On a CPU, compiling mujoco_warp.step takes minutes, so it is timed only if the user has chosen the engine.
+    # On a CPU, compiling mujoco_warp.step takes minutes, so it is timed only if sim.physics is set to an engine.
     if library is not None and (device.type == "cuda" or task.cfg.sim.physics != "auto"):
         steps_of["library"] = library
     alone = {name: _control_period(task, step) for name, step in steps_of.items()}
@@ -396,7 +396,7 @@ def time_steps(task: BaseTask, steps: int, repeats: int, act: Callable[[TensorDi
 
 
 def _control_period(task: BaseTask, step: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that runs the engine steps of one control step. For a captured task, it is a CUDA graph."""
+    """Return a function that runs the engine steps of a control step; for a captured task, the function runs a CUDA graph."""
 
     def run() -> None:
         for _ in range(task.cfg.control.decimation):

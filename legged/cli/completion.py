@@ -78,7 +78,7 @@ def whole_parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         group, _, inside = name.partition(" ")
         parser = load(name).build_parser()
-        for action in parser._actions if name != "migrate" else ():  # `migrate --task` names another's task
+        for action in parser._actions if name != "migrate" else ():  # `migrate --task` is a task of legged_gym
             if action.dest in COMPLETED:
                 function = f"_legged_complete_{COMPLETED[action.dest]}"
                 action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]

@@ -135,8 +135,8 @@ def check_simulation(args: argparse.Namespace) -> None:
 
 
 def motors_of(args: argparse.Namespace, robot: Robot, contract: Contract | None) -> tuple[Robot, Motors]:
-    """Return the robot, including the inertia of its motors' rotors, and the motors. By default rotors and motors are those
-    with which the policy in `contract` was trained. Options of the command change these settings.
+    """Return the robot and its motors. The robot includes the inertia of the motors' rotors. By default rotors and motors
+    are those with which the policy in `contract` was trained. Options of the command change these settings.
 
     Raises:
         ConfigError: a setting of the motors is wrong; see `motors_config`.

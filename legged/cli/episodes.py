@@ -160,7 +160,7 @@ def record(args: argparse.Namespace) -> int:
     register_given(args, "policy")
     wish, policy = _wish_of(args), policy_of(args.policy, args.checkpoint)
     _pages(args.page, wish.episodes)
-    if args.ended is not None:  # check the name before a new recording replaces an older one
+    if args.ended is not None:  # check --ended before a new recording replaces an older one
         terms = policy.cfg.terminations
         check_ended(args.ended, [*terms.failures, *terms.time_outs, TIME_UP, NO_NUMBERS])
     check_wish(policy, wish)

@@ -41,7 +41,7 @@ from legged.tables import screen_table
 ROBOTS = 16
 """Default number of robots that follow each command of a grid."""
 MOST_SIZES = 16
-"""`check_points` allows MOST_ROBOTS / MOST_SIZES robots for each size, so that this many sizes can be simulated at once."""
+"""Number of terrain sizes that can be simulated at once with the largest allowed value of --robots-per-point."""
 ENVIRONMENTS = 256
 """Default number of episodes; each runs in a separate environment."""
 IN_GYMNASIUM = 20
@@ -181,7 +181,7 @@ def grid(args: argparse.Namespace) -> int:
 def terrain(args: argparse.Namespace) -> int:
     """Measure success over the size of terrain: `legged evaluate terrain anymal_c --types stairs_up,gap`.
 
-    For each terrain type, the size grows from tile to tile, for example the height of steps. Robots start in the middle of
+    For each terrain type, the size (for example the height of steps) grows from tile to tile. Robots start in the middle of
     the tiles. The share of robots that walk out of their tile is printed, drawn to success_<physics>.png, and written to
     evaluation_<physics>.json.
     """
@@ -209,9 +209,9 @@ def terrain(args: argparse.Namespace) -> int:
 def stress(args: argparse.Namespace) -> int:
     """Measure the robustness of a policy: `legged evaluate stress anymal_c`.
 
-    Robots walk on stairs and on the flat. Each line of the table has a different disturbance (payload, friction, weak motors,
-    delay, ...). More lines are for terrain that no task is trained on, and for other solver settings. The share of robots
-    that succeed is printed and written to stress_<physics>.json and .png.
+    Robots walk on stairs and on the flat. The lines of the table are for disturbances (payload, friction, weak motors,
+    delay, ...), for terrain on which no task is trained, and for different solver settings. The share of robots that
+    succeed is printed and written to stress_<physics>.json and .png.
     """
     robots = check_points(args.robots_per_point, args.full)
     check_between("--riser", args.riser, 0.0, 1.0, "m")
@@ -338,8 +338,8 @@ def onnx(args: argparse.Namespace) -> int:
     model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
-    With --vx, --vy or --yaw the errors over a grid of commands are measured. With --rmse the command also prints the
-    first policy, by training time where it is known, that follows the grid with at most this error and without a fall.
+    With --vx, --vy or --yaw the errors over a grid of commands are measured, and policies are sorted by training time. With
+    --rmse the command also prints the first policy whose velocity RMSE is at most --rmse and whose robot never falls.
     """
     grid = _grid_in(args)
     settling = grid.settle_s if grid else SETTLING_S
@@ -387,7 +387,7 @@ def _exported_file(name: str) -> Path | None:
 
 
 def _file(name: str) -> Path:
-    """Return the ONNX file `name`, or the ONNX file in the exported folder `name`, which must exist."""
+    """Return the ONNX file `name`, or the ONNX file in the exported folder `name`. Raise ConfigError if neither exists."""
     path = _exported_file(name)
     if path is None or not exists(path) or not path.is_file():
         raise ConfigError(f"POLICY: there is no ONNX file '{name}', and no exported folder (with {EXPORTED[0]}) of this name")

@@ -65,7 +65,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run the command that begins `argv`; return its exit code. If `argv` is None, take the arguments of this process."""
+    """Run the command that `argv` begins with; return its exit code. If `argv` is None, use the arguments of this process."""
     words = sys.argv[1:] if argv is None else argv
     name, rest = split(words)
     if name is None:

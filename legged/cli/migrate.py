@@ -114,7 +114,7 @@ def _robot_text(robot: Robot, entries: dict[str, Any], folder: Path, source: Pat
 
 
 def _asset(file: Path, result: Translation) -> str:
-    """Return the path of the robot's model file. Without such a file in a folder above `file`, return the configured path."""
+    """Return the path of the robot's model file. If no folder above `file` contains this file, return the configured path."""
     asset = asset_of(result)
     found = (relative(folder / asset) for folder in file.resolve().parents if asset and exists(folder / asset))
     return next(found, asset or "FILE.urdf")

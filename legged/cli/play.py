@@ -60,7 +60,7 @@ SHOWN_ON_A_PLANE = 4
 def play(args: argparse.Namespace) -> int:
     """Film a policy, measure it and export it: `legged play anymal_c_flat`, or `python play.py --task anymal_c_flat`.
 
-    On a machine with a display, a window opens before the film is made. There the arrow keys steer the robot.
+    On a machine with a display, a window opens before the film is made. In this window the arrow keys steer the robot.
     """
     if args.gif and args.no_video:
         raise ConfigError("--gif: cannot be combined with --no-video; leave out one of them")

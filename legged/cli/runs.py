@@ -77,7 +77,7 @@ def runs(args: argparse.Namespace) -> int:
     """
     import_given(args)
     folder: Path = args.out or (args.folders[0] if args.folders else LOGS)
-    if exists(folder) or args.out is not None:  # a FOLDER that does not exist is reported by `folders_in`
+    if exists(folder) or args.out is not None:  # otherwise `folders_in` reports that the folder does not exist
         ready_to_write(folder, 4.0)
     with hint_at_sub_command("runs", list(map(str, args.folders))):
         found = {run.resolve(): run for given in args.folders or [LOGS] for run in folders_in(given)}

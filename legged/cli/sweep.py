@@ -258,7 +258,7 @@ class Worker:
         until, plan, settings = self.plan.cfg.train.runner.max_iterations, self.plan, self.plan.settings(trial.params)
 
         def listen(found: Evaluated) -> str:
-            """Report the figure to Optuna. Return the reason to end the training early, or an empty text to continue."""
+            """Report an evaluation to Optuna. Return the reason to end the training early, or an empty text to continue."""
             now = found.figures[plan.figure]
             if not math.isfinite(now):
                 return ""
@@ -290,7 +290,7 @@ def value_of(plan: Plan, history: Sequence[Evaluated]) -> float:
     """Return the value of the objective for a training.
 
     Raises:
-        NoValue: the training did not reach the target, or the figure was never finite.
+        NoValue: the training did not reach the target, or no evaluation gave a finite figure.
     """
     objective, figure = plan.given.objective, plan.figure
     values = [found.figures[figure] for found in history if math.isfinite(found.figures[figure])]

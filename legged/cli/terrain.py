@@ -55,7 +55,7 @@ def terrain(args: argparse.Namespace) -> int:
         types = terrain_types("--types", args.types)
         sizes = replace(cfg.terrain, mesh_type="height_map", num_rows=1, num_cols=len(types), max_init_terrain_level=0)
         check_terrain(replace(sizes, proportions=dict.fromkeys(types, 1.0 / len(types))), cfg.origins)
-        # The map shows the first column of the grid on the right, so the order of the types is reversed.
+        # On the map, the first column of the grid is on the right. So the order of the types is reversed.
         grid = tiles(cfg.terrain, [types[::-1]], args.difficulty, cfg.env.seed)
         levels = [f"{args.difficulty:g}"]
     make_folder(args.out)

@@ -150,7 +150,7 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
             training.close(folder, finished)
     if finished:
         return 0
-    # A training can stop without a signal to this process: if its output is lost, or if a signal stops another process.
+    # Even without a signal to this process, a training stops if its output is lost or if another process gets a signal.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
 
 
@@ -243,7 +243,7 @@ class _Training:
                     write_timing(folder, self.timing(False, " ".join(said.split())[:500]))
                     self._report(folder, film=False)
             full = full_disk_in(error)
-            if full is not None and not isinstance(error, RunError):  # an error of TensorBoard's writer names no file
+            if full is not None and not isinstance(error, RunError):  # errors of TensorBoard's writer do not state the file
                 raise RunError(f"{relative(folder)}: {reason(full)}") from error
             raise
 

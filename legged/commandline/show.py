@@ -170,7 +170,7 @@ def _effect(task: BaseTask, i: int) -> str:
     on_joint = model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
     gains = model.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
     bias = model.actuator_biastype[i] != mujoco.mjtBias.mjBIAS_NONE
-    # Only a joint's motor (fixed gain, no bias) has a force proportional to the control. Else the text gives the control.
+    # A joint's motor (fixed gain, no bias) has a force proportional to the control. For others, the text has the control.
     if not on_joint or not gains or bias:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])

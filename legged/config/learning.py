@@ -24,7 +24,7 @@ class EstimatorConfig:
     latent: int = field(default=0, metadata=between(0, 16384))
     """Number of outputs in addition to the estimates. These outputs have no targets; the policy's gradient trains them."""
     policy_gradient: bool = False
-    """Train the estimates with their targets and with the policy's gradient; otherwise only with their targets."""
+    """True: the targets and the policy's gradient train the estimates. False: only the targets train them."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class PolicyConfig:
 
 @dataclass(frozen=True)
 class AlgorithmConfig:
-    """Settings of PPO, mostly with rsl-rl's names. Distillation has its own section (DistillationConfig). Of the
-    settings here, Distillation uses only `optimizer` and `use_mixed_precision`.
+    """Settings of PPO, mostly with rsl-rl's names. The algorithm `Distillation` uses only `optimizer` and
+    `use_mixed_precision` of them. The other settings of `Distillation` are in DistillationConfig.
     """
 
     class_name: Literal["PPO", "Distillation"] = "PPO"
@@ -128,8 +128,8 @@ class DistillationConfig:
     """Loss on the difference between the actions of student and teacher, both without exploration. `mse`: the squared
     difference. `huber`: squared for differences up to 1, linear for larger ones."""
     gradient_length: int = field(default=8, metadata=between(1, 100_000))
-    """Number of successive control steps that each gradient step uses, for all robots. In a recurrent student the gradient
-    flows back through all these steps. The number must divide train.runner.num_steps_per_env."""
+    """Number of successive control steps, of all robots, from which a gradient step is computed. In a recurrent student the
+    gradient flows back through all these steps. The number must divide train.runner.num_steps_per_env."""
     num_learning_epochs: int = field(default=2, metadata=between(1, 1000))
     """Number of passes over the steps of an iteration."""
     learning_rate: float = field(default=1e-3, metadata=positive(1, low=1e-12))
@@ -172,7 +172,7 @@ class RunnerConfig:
     """Precision of matrix products during training. On a GPU `tf32` is faster, but keeps only 10 of the 23 mantissa bits of
     the factors. On a CPU `tf32` keeps all bits, and allows a faster library (oneDNN)."""
     experiment_name: str = field(default="", metadata=NAME)
-    """Folder under logs/; the task's name when empty."""
+    """Name of the folder under logs/. If it is empty, the folder has the task's name."""
     run_name: str = field(default="", metadata=NAME)
     """Text after the date and time in the name of the run folder."""
     report: bool = True

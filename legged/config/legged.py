@@ -39,7 +39,7 @@ MEASURED = rescaled("m", items(500, between(-100, 100)))
 FASTEST = 20.0
 """Largest command of an evaluation [m/s, rad/s]. Reason: the area of the terrain grows with the square of the command."""
 Axis = tuple[float, float, float]
-"""Lowest value, highest value, and step."""
+"""One axis of a command grid: lowest value, highest value, and step."""
 AXIS = between(-FASTEST, FASTEST)
 Law = Literal["P", "V", "T"]
 """Control law of a joint."""
@@ -220,12 +220,12 @@ class LeggedDomainRandConfig(DomainRandConfig):
     """Any name -> a temporary force on a body of the robot."""
 
     observed_forces: dict[str, ForceConfig] = field(default_factory=dict)
-    """Any name -> a force that is observed (`_obs_push_force`) but does not act. Play and evaluation move
-    `forces` here, so that the observation keeps its size and scale."""
+    """Any name -> a force that is observed (`_obs_push_force`) but does not act. Play and evaluation move the entries of
+    `forces` to this setting, so that the observation keeps its size and scale."""
 
     def nominal(self) -> Self:
         plain = super().nominal()
-        by_flag: dict[str, Range | DrawConfig] = {}  # both ranges have flags, which play and evaluation set to false
+        by_flag: dict[str, Range | DrawConfig] = {}  # play and evaluation set the flags of these two ranges to false
         if self.randomize_friction:
             by_flag["friction"] = self.friction_range
         if self.randomize_base_mass:
@@ -293,7 +293,7 @@ class LeggedObservationsConfig(ObservationsConfig):
         default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0},
         metadata=rescaled_by_term("_obs_", -1, between(-LARGEST, LARGEST)),
     )
-    """Term -> factor; 1 without an entry. Without an entry, `commands` have the factors of base_lin_vel and base_ang_vel."""
+    """Term -> factor. Without an entry, `commands` have the factors of base_lin_vel and base_ang_vel; other terms have 1."""
     noise: dict[str, float] = field(
         default_factory=lambda: {
             "base_lin_vel": 0.1,
@@ -307,7 +307,7 @@ class LeggedObservationsConfig(ObservationsConfig):
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     heights_offset: float = field(default=0.5, metadata=rescaled("m", between(-100, 100)))
-    """Distance of the ground below the base at which the observed height is 0 [m]."""
+    """An observed height is 0 if the ground is this far below the base [m]."""
     heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))
     """Largest absolute value of an observed height [m]."""
     depth_limit: float = field(default=0.0, metadata=rescaled("m", between(0, 100)))
@@ -338,8 +338,8 @@ class EvaluationConfig:
     yaw: Axis = field(default=(-1.0, 1.0, 0.5), metadata=quantity("rad/s", AXIS))
     """Yaw rates of the command grid: lowest, highest, step [rad/s]."""
     stairs: float = field(default=0.36, metadata=positive(10))
-    """Height of the stairs' steps in a table of many trainings, as a share of rewards.base_height_target. The table shows the
-    success rate at this height, or at the next larger height that was measured."""
+    """Step height of stairs, as a share of rewards.base_height_target. A table of many trainings shows the success rate
+    at this height, or at the next larger height that was measured."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class DrawConfig:
     robot. Null: the property's default."""
     grow: Range = field(default=(0.0, 0.0), metadata=ITERATIONS)
     """First and last training iteration in which the range widens. [0, 0] means the full range from the start. The range
-    widens from the property's neutral value. If this value is outside the range, it widens from the nearer end."""
+    widens from the point of the range that is nearest to the property's neutral value."""
 
 
 @dataclass(frozen=True)

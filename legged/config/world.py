@@ -47,8 +47,8 @@ class SimConfig:
     step: Literal["auto", "fused", "library"] = "auto"
     """Implementation of a physics step in mujoco_warp. `library`: mujoco-warp's own code, with dozens of kernel launches.
     `fused`: four kernel launches (dynamics without contacts, contacts, contact forces, integration). Models that `fused` does
-    not support are refused. `auto`: `fused` if it supports the model. Otherwise `auto` is mujoco-warp's code, in which one
-    fused kernel computes the contact forces if the model has at most 60 degrees of freedom."""
+    not support are refused. `auto`: `fused` if it supports the model. Otherwise `auto` is mujoco-warp's code. For
+    models with at most 60 degrees of freedom, one fused kernel computes the contact forces in this code."""
     nconmax: int = field(default=24, metadata=between(1, 10_000))
     """Number of contacts per robot for which mujoco_warp and newton allocate memory. In the collision code of mujoco-warp
     and Newton, all robots share this memory, and pairs of shapes that are close but do not touch take a part of it."""

@@ -157,8 +157,8 @@ def make_operator(args: argparse.Namespace) -> Operator:
 
 
 class Interruptible(Operator):
-    """An operator that also ends the program when a signal of `ENDING` arrives, such as Ctrl-C. If a robot is connected, the
-    program brakes the robot first. Without a robot the program ends at once.
+    """An operator that also ends the program when a signal in `ENDING` arrives, for example from Ctrl-C. If a robot is
+    connected, the program brakes the robot first. Without a robot the program ends at once.
     """
 
     def __init__(self, operator: Operator) -> None:

@@ -47,7 +47,7 @@ RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "command_dead_zone": ("0 or more", lambda x: x >= 0.0),
     "control_dt": ("between 0.001 and 1", lambda x: (x >= 1e-3) & (x <= 1.0)),
 }
-"""Key of policy.json -> allowed numbers, in words and as a function; all must also be finite."""
+"""Key of policy.json -> allowed numbers, in words and as a function. Each number must also be finite."""
 
 
 def plain_json(text: str | bytes) -> Any:
@@ -76,7 +76,7 @@ def plain_json(text: str | bytes) -> Any:
 
 
 def need_of(term: str) -> str:
-    """Return the input of an observation term: its entry in SENSORS or, if it has none, the source with the term's name."""
+    """Return the input of an observation term: the entry in SENSORS or, without an entry, the source with the term's name."""
     return SENSORS.get(term, f"{SOURCE}{term}")
 
 

@@ -118,7 +118,7 @@ def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[s
         usable &= np.isfinite(log[name]).all(axis=1)
     new = np.concatenate([[True], np.diff(log["times"]) != 0.0])
     rows, left_out = np.flatnonzero(usable & new), np.cumsum(new & ~usable)
-    if len(rows) < SHORTEST:  # if the robot has no clock, all readings have the same time, and one is new
+    if len(rows) < SHORTEST:  # if the robot has no clock, all times are equal, and only the first is new
         return None
     steps = np.diff(log["times"][rows])
     usual = float(np.median(steps))

@@ -85,7 +85,7 @@ STILL = 0.1
 """Dead zone of a stick as a share of its range."""
 DEVICE = Path("/dev/input/js0")
 AXES = {1: (0, -1.0), 0: (1, -1.0), 3: (2, -1.0)}
-"""Axis of the gamepad -> (index in the command vx, vy, yaw rate; sign). Sticks up and left give positive commands."""
+"""Axis of the gamepad -> (index in the command vx, vy, yaw rate; sign). A stick moved up or left gives positive commands."""
 BUTTONS = {0: Event.WALK, 1: Event.STOP, 2: Event.DAMPING, 3: Event.STAND, 6: Event.QUIT, 7: Event.IDLE}
 """Number of a button -> event. On an Xbox gamepad these buttons are A, B, X, Y, back and start."""
 HELP = {
@@ -121,7 +121,7 @@ class Operator(ABC):
 
 
 class Ramp:
-    """Limiter of commands. It clips them to the policy's ranges, zeroes speeds in the dead zone and limits their changes."""
+    """Limiter of commands: clips them to the policy's ranges, zeroes speeds in the dead zone, and limits accelerations."""
 
     def __init__(self, contract: Contract) -> None:
         self._low, self._high = contract.command_ranges.T

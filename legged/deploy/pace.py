@@ -12,7 +12,7 @@ import numpy as np
 PRIORITY = 20
 """Real-time priority of the process under Linux's SCHED_FIFO (1 to 99)."""
 END_S = 1.0
-"""Longest wait for the last status lines to be printed, at the end of the program [s]."""
+"""Longest wait at the end of the program until the last status lines are printed [s]."""
 
 
 def take_priority(priority: int = PRIORITY) -> bool:

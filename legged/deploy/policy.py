@@ -49,7 +49,7 @@ class Network:
         wanted: dict[str, tuple[int, ...]] = {"obs": (contract.width,)}
         wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
         found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
-        if list(found.items()) != list(wanted.items()):  # `found` lacks the batch size, because it is a name
+        if list(found.items()) != list(wanted.items()):  # the batch size is a name, so `found` lacks it
             raise ConfigError(f"{path}: has the inputs {found}, but policy.json says {wanted}")
         self.restart()
         for _ in range(WARM_UP):
@@ -111,7 +111,7 @@ class Policy:
         self.observation = self._observe(reading, command)
         given = self._network.run(self.observation).astype(float)
         actions = np.clip(given, -contract.action_clip, contract.action_clip)
-        self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping would make an infinite output finite
+        self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping has made infinite outputs finite
         targets = contract.default.copy()
         targets[contract.acted] += contract.action_scale * self.actions
         return targets

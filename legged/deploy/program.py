@@ -193,8 +193,8 @@ class Program:
     def _enter(self, state: State, now: float) -> None:
         self._say(f"{self.state.value} -> {state.value}", now)
         if state is State.STAND and self._reading is not None:
-            # A lying robot first folds its legs. A walking robot is on its feet, and its motors carry its weight only while
-            # the targets differ from the joint angles. So its targets start from their last values, not from the angles.
+            # A lying robot first folds its legs. In a walking robot, the difference of targets and joint angles gives the
+            # torques that carry the weight. So the targets start from their last values, not from the joint angles.
             damped, bent = self.state is State.DAMPING, self._contract.crouch
             first = self._reading.positions if damped else self._asked[0]
             lies = damped and np.abs(first - self._contract.default).max() > THERE
@@ -222,7 +222,7 @@ class Program:
             clamped = clamp_targets(targets, reading.positions, reading.velocities, contract)
             return clamped, contract.stiffness, contract.damping
         positions = contract.default
-        if reading is not None:  # a NaN angle would give a NaN torque, even with a P gain of 0
+        if reading is not None:  # a NaN target would give a NaN torque, even with a P gain of 0
             positions = np.where(np.abs(reading.positions) < FAR, reading.positions, positions)
         return positions, nothing, nothing if self.state is State.IDLE else self._braking
 
@@ -246,7 +246,7 @@ class Program:
         )
 
     def _settle(self) -> None:
-        """Brake the joints until a standing robot has sunk to the ground."""
+        """Brake the joints for `SETTLE_S`, so that a standing robot sinks to the ground. An idle robot is not braked."""
         if self.state in (State.IDLE, State.STOP) and self._reading is None:
             return
         if self.state in MOVING:

@@ -120,7 +120,7 @@ def clamp_targets(targets: np.ndarray, positions: np.ndarray, velocities: np.nda
 
 
 def braking(contract: Contract) -> np.ndarray:
-    """Return the D gains (D,) for braking [N m s/rad]. At half of a joint's largest speed, braking needs its largest torque.
-    However, a gain is at most four times the policy's D gain.
+    """Return the D gains (D,) for braking [N m s/rad]. A joint at half of its largest speed is braked with its
+    largest torque, or with less torque if the gain reaches its limit, four times the policy's D gain.
     """
     return np.minimum(contract.torque_limits / (SLOWEST_FALL * contract.velocity_limits), MOST_DAMPING * contract.damping)

@@ -74,7 +74,7 @@ ENABLED = 1
 SERIES = 0
 """Value of `mode_pr` with which targets of G1's ankles and waist are pitch and roll angles, not angles of the motors."""
 OTHER_G1 = {1: "23 joints", 3: "a locked waist", 4: "23 joints", 6: "a locked waist", 9: "no legs"}
-"""`mode_machine` of a G1 with fewer than 29 joints -> what is different (from the table in Unitree's description of G1)."""
+"""`mode_machine` of a G1 with fewer than 29 joints -> what differs. Source: a table in Unitree's description of G1."""
 BITS = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 """Byte -> the byte with its bits in reverse order."""
 SELECT, L2, B = (2, 3), (2, 5), (3, 1)

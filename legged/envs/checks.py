@@ -60,7 +60,7 @@ def check_task(cls: type, cfg: TaskConfig) -> None:
 
 def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
     """Return the names of the figures that evaluations during training report for a task of class `cls`: the standard
-    figures, then its metrics. The first one decides which policy is best, unless train.runner.best_by names another.
+    figures, then the task's metrics. The first one decides which policy is best, unless train.runner.best_by names another.
     """
     first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
     return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]

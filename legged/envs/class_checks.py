@@ -25,7 +25,7 @@ _TORQUES = "control.control_type, .stiffness and .damping set the control law; o
 _RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
 
 HOOKS = {
-    # legged_gym and its forks
+    # Methods of legged_gym and its forks.
     "_parse_cfg": "__init__() gets the complete configuration; your own numbers go under the key 'custom' in the YAML",
     "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
     "post_physics_step": _STEP,
@@ -69,7 +69,7 @@ HOOKS = {
     "_draw_debug_vis": _DRAWING,
     "render": _DRAWING,
     "set_camera": _DRAWING,
-    # Isaac Lab
+    # Methods of Isaac Lab.
     "_setup_scene": _BUILD,
     "_pre_physics_step": _TORQUES,
     "_apply_action": _TORQUES,

@@ -14,7 +14,7 @@ Function = Callable[[], Tensor]
 class ConcurrentTerms:
     """Terms that run at the same time as `check_termination`, on several streams. On the CPU they run one after the other.
 
-    On a GPU, a term launches a few short kernels, each of which waits for the kernel before. If all rewards of a quadruped
+    On a GPU, a term launches a few short kernels, each of which waits for the previous one. If all rewards of a quadruped
     run on one stream, they take a tenth of a step. On parallel streams they add almost no time to the step.
     """
 

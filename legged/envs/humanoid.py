@@ -23,7 +23,7 @@ TORSO = 1
 
 @dataclass(frozen=True)
 class HumanoidConfig(TaskConfig):
-    """Configuration of the humanoid's task: the sections of every task, and two settings."""
+    """Configuration of the humanoid's task: the sections that every task has, and two settings."""
 
     healthy_z: Range = field(default=(1.0, 1.5), metadata=quantity("m", between(0, 10)))
     """Lowest and highest torso height at which the humanoid counts as standing [m]."""

@@ -22,7 +22,7 @@ MOST_POINTS = 10_000
 
 
 def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Check the settings of a legged robot that `check_task` does not check. `cls` is the task's class.
+    """Check a legged robot's settings, except those that `check_task` checks. `cls` is the task's class.
 
     Raises:
         ConfigError: a setting does not fit the robot or another setting.
@@ -117,7 +117,7 @@ def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
     """Check that passive joints are observed only if the robot has passive joints.
 
     Raises:
-        ConfigError: the robot has no passive joints.
+        ConfigError: passive joints are observed, but the robot has no passive joints.
     """
     names = ("passive_pos", "passive_vel")
     for group, terms in ((name, group.terms) for name, group in groups_in(cfg).items()):

@@ -1,5 +1,5 @@
-"""Attributes of tasks in legged_gym and its forks, which tasks of this package can read too. Some are the package's tensors
-under a second name. Others are computed at each reading. For those that do not exist here, the error gives a hint.
+"""Attributes of tasks in legged_gym and its forks, for tasks of this package. Some are the package's tensors under a second
+name. Others are computed at each reading. Some do not exist here, so reading one raises an error with a hint.
 
 These attributes cost nothing until they are read. If a class sets an attribute with such a name, its own value is used.
 """
@@ -20,8 +20,8 @@ IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordi
 
 
 class ReadOnly(Tensor):
-    """Value of an attribute that is computed at each reading. Writing to this tensor or to a view would not change the task.
-    So an attempt raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
+    """Value of an attribute that is computed at each reading. Writing to this tensor or to a view of it would not change the
+    task, so it raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
     """
 
     instead: str = ""
@@ -301,7 +301,7 @@ class LeggedGymNames:
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
     def remember(self) -> None:
-        """Store the values of `KEPT` that a term has read. After that, BaseTask overwrites `last_actions`."""
+        """Store values of names in `KEPT` that a term has read, before BaseTask's `remember` overwrites `last_actions`."""
         for name in vars(self).get("_kept_names", ()):
             vars(self)[name].copy_(KEPT[name](self))
             if name == "last_last_actions":  # a new episode must not see actions of the old one

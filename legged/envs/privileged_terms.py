@@ -60,7 +60,7 @@ MIRROR_KINDS["push_force"] = "vectors"
 
 
 def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
-    """Return name -> force. Those of `domain_rand.forces` act on the robot, and all others are observed as 0."""
+    """Return name -> force. Forces that are only in `domain_rand.observed_forces` do not act, and are observed as 0."""
     return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
 
 

@@ -32,7 +32,7 @@ class SavedTask(RandomizedTask):
         self.randomization.load_progress(progress.get("randomization", {}))
 
     def parts(self) -> dict[str, Any]:
-        """Return name in saved states -> part of the task. The tensors that a part's `STATE` names are saved. A subclass adds
+        """Return name in saved states -> part of the task. A part's `STATE` lists the tensors that are saved. A subclass adds
         its own parts.
         """
         return {

@@ -357,7 +357,7 @@ class Terms:
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
         """Sum of squared distances from the default angles, for all joints except wheels and joints that swing a leg forward
-        and back. Abduction and yaw of the hips, the waist and the arms are counted [rad^2].
+        and back. The waist, the arms, and the abduction and yaw of the hips are counted [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 

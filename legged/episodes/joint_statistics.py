@@ -201,8 +201,8 @@ def notes_of(found: Mapping[str, JointStatistics]) -> str:
 
 
 def draw_statistics(found: Mapping[str, JointStatistics], path: Path) -> None:
-    """Draw the mean of every joint over the gait cycle, with a band of one standard deviation. Without cycles, draw the
-    means and standard deviations of all joints side by side. Each policy has its own colour and line style.
+    """Draw the mean of every joint over the gait cycle, with a band of one standard deviation. If a policy has no
+    cycles, draw the means and standard deviations of all joints side by side. Each policy has its own colour and line style.
     """
     cyclic = all(len(one.cycle_s) for one in found.values())
     names, first = _measured(found), next(iter(found.values()))

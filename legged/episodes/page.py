@@ -41,7 +41,7 @@ BUDGET_MB = 3.0
 """Largest total size of the pictures of a page before base64 coding, which adds a third [MB]."""
 OTHERS = "#BBBBBB"
 MOST_PARTS = 7
-"""Number of reward parts with their own colours. They are the largest ones; the other parts are summed."""
+"""The `MOST_PARTS` largest reward parts have their own colours. All other parts are summed."""
 MOST_LINES = 8
 """Largest number of lines of a plot."""
 LEG = re.compile(r"(?i)[lr]|[lr][fh]|[bfhmr][lr]|left|right|front|rear|hind|back")
@@ -120,8 +120,8 @@ class Projector:
 
     def show(self, number: int) -> dict[str, Any]:
         """Return the film of an episode for its page. `pictures` are JPEGs in base64, and `every` is the number of steps from
-        one picture to the next. If nothing can be rendered, the film has the reason `why` instead of `pictures`, and for a
-        stick figure the `parents` and the `places` (T', B, 3) of B bodies, world frame [m].
+        one picture to the next. If nothing can be rendered, the film has no `pictures`. It then has the reason `why`, and
+        for a stick figure of B bodies their `parents` and their `places` (T', B, 3) at T' steps, in the world frame [m].
         """
         steps = int(self.episodes.lengths[number])
         every = max(1, round(1.0 / (FPS * self.episodes.dt)), -(-steps // MOST_PICTURES))
@@ -261,7 +261,7 @@ class Panels:
         return [_line(labels[i], series, i, COLORS[k % len(COLORS)]) for k, i in enumerate(chosen)]
 
     def _undriven(self, array: str, series: str, title: str, unit: str, first: int = 0) -> list[dict[str, Any]]:
-        """Return plots of the columns of `array` without a motor, from `first` on. Each plot has at most MOST_LINES lines."""
+        """Return plots of the columns of `array`, from `first` on, that no motor drives. Each has up to MOST_LINES lines."""
         names, driven = self.episodes.columns(array), {joint[array] for joint in self.joints}
         columns = [i for i in range(first, len(names)) if i not in driven]
         if columns:

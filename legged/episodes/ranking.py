@@ -92,7 +92,7 @@ def order_of(figures: Figures, by: str, ended_by: str | None = None) -> list[int
 
 
 def check_ended(name: str, ends: Sequence[str]) -> None:
-    """Check that a term of that name can end an episode.
+    """Check that a term called `name` can end an episode.
 
     Raises:
         ConfigError: there is no such term.

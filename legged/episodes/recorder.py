@@ -230,8 +230,8 @@ def record_episodes(
     if place is not None:
         place()
     physics, (n, width), shares = task.physics, record.row.shape, shares_of(episodes, task.num_envs)
-    # The columns of a row are the quantities of a step, then qpos and qvel after its resets: the first state of the next
-    # episode, if one ended.
+    # A row holds the quantities of a step, then qpos and qvel after the resets of this step. If an episode ended in this
+    # step, qpos and qvel are the first state of the next episode.
     whole = width + physics.qpos.shape[1] + physics.qvel.shape[1]
     length = max(1, min(LONGEST_CHUNK, int(CHUNK_MB * 2**20 / (4 * n * whole)), task.max_episode_length))
     buffer = torch.zeros(length, n, whole, device=task.device)

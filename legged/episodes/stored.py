@@ -31,10 +31,10 @@ FORMAT = 1
 """Version of episodes.json. A new version means that older files can no longer be read."""
 PER_EPISODE = ("episode_start", "robot", "failed", "timed_out", "ended_by", "first_qpos", "first_qvel")
 """Arrays with a row for each episode. All other arrays have a row for each control step, one episode after another.
-`episode_start` is the row of an episode's first step in those arrays; its extra last entry is their number of rows. `robot`
-is the index of the robot. `failed` is True if the episode ended in a failure, `timed_out` if it ended by time or by a term
-that is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before the
-first step.
+`episode_start` is the row of an episode's first step in the other arrays; an extra last entry is the total number of steps.
+`robot` is the index of the robot. `failed` is True if the episode ended in a failure, `timed_out` if it ended by time or by a
+term that is no failure. `ended_by` has a flag for each of `terminations`. `first_qpos` and `first_qvel` are the state before
+the first step.
 """
 ALWAYS = ("qpos", "qvel", "action", "reward", "reward_parts")
 JOINTS = ("joint_pos", "joint_vel", "torque")

@@ -46,7 +46,7 @@ def few_commands(cfg: LeggedConfig) -> Grid:
 
 
 def thinned(values: list[float]) -> list[float]:
-    """Return about half of the values, evenly spread, with the first and the last one. Of two values, return the first."""
+    """Return about half the values, evenly spread from the first to the last. If there are two values, return the first."""
     keep = (len(values) + 1) // 2
     last = len(values) - 1
     return [values[round(i * last / (keep - 1))] for i in range(keep)] if keep > 1 else values[:1]

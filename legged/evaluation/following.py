@@ -39,8 +39,8 @@ def evaluate_following(
 ) -> int:
     """Measure tracking on the commands of `grid`, unless it is None. Measure success on terrain, unless `sizes` (terrain type
     -> sizes) is empty, with `robots` robots for each size. Print tables, write evaluation_<physics>.json and .png and
-    success_<physics>.png, and return the exit code. If tracking or success is not measured, the JSON file keeps its older
-    values if they are for the same checkpoint.
+    success_<physics>.png, and return the exit code. If tracking or success is not measured, its older values stay in the
+    JSON file, provided that they are for the same checkpoint.
 
     Raises:
         RunError: a file can't be written.

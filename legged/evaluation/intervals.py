@@ -21,7 +21,7 @@ def wilson(successes: int, trials: int, z: float = Z95) -> Interval:
     share, scale = successes / trials, 1.0 + z**2 / trials
     middle = (share + 0.5 * z**2 / trials) / scale
     half = z / scale * sqrt(share * (1.0 - share) / trials + 0.25 * z**2 / trials**2)
-    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # the interval contains the share
+    return max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))  # rounding must not exclude the share
 
 
 def newcombe(first: tuple[int, int], second: tuple[int, int]) -> Interval:

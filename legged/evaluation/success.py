@@ -194,7 +194,7 @@ def place(task: LeggedRobot, robots: int) -> None:
 
 def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robots: int) -> tuple[list[dict[str, Any]], int]:
     """Measure success on one terrain type, with `robots` robots for each of the `sizes`. The task's terrain comes
-    from `tiles_of_sizes`. Return the figures of each size, and how often full memory made a robot lose contacts in a step.
+    from `tiles_of_sizes`. Return the figures of each size, and the number of steps with lost contacts (see `run_out`).
     """
     scores, lost = run_out(task, act, robots)
     outcomes, times = scores.outcome.view(-1, robots).cpu(), scores.time_s.view(-1, robots).cpu()
@@ -203,8 +203,8 @@ def measure_success(task: LeggedRobot, act: Policy, sizes: Sequence[float], robo
 
 @torch.inference_mode()
 def run_out(task: LeggedRobot, act: Policy, robots: int) -> tuple[Scores, int]:
-    """Let all robots walk out of their tiles, with `robots` robots for each size. Return their scores, and how often
-    full memory made a robot lose contacts in a step.
+    """Let all robots walk out of their tiles, with `robots` robots for each size. Return their scores, and the
+    number of control steps in which a robot lost contacts because memory was full, summed over robots.
     """
     place(task, robots)
     task.reset()
@@ -277,7 +277,7 @@ def success_over_difficulty(setting: Setting, sizes: Mapping[str, Sequence[float
 def _on_type(
     setting: Setting, name: str, sizes: Sequence[float], robots: int, changes: Sequence[tuple[str, Any]]
 ) -> tuple[list[dict[str, Any]], int]:
-    """Build the task for one terrain type and measure success. The task can be freed after the call."""
+    """Build the task for one terrain type and measure success. The task is not returned, so its memory can be freed."""
     cfg: Any = override(setting.policy.cfg, changes)
     terrain = tiles_of_sizes(name, sizes, cfg.terrain, cfg.env.seed)
     gc.collect()  # the previous task is in a reference cycle, and a GPU may not have the memory for two tasks
@@ -372,7 +372,7 @@ def success_line(label: str, entry: dict[str, Any]) -> Line:
 
 def success_chart(title: str, lines: Sequence[tuple[dict[str, Any], Line]]) -> Chart:
     """Return the chart of success over size. `lines` holds pairs: the entry of a terrain type in a result, and its curve. A
-    dotted line marks the hardest size of the training. If there are several such sizes, the dotted lines name their curves.
+    dotted line marks the hardest size of the training. If these sizes differ, a label at each dotted line names its curves.
     """
     ends: dict[float, list[str]] = {}
     for entry, line in lines:

@@ -26,7 +26,7 @@ because a single tile may have an easy way out.
 def on_terrain(cfg: LeggedConfig, side: float, spawn_range: float) -> list[tuple[str, Any]]:
     """Return overrides for a task on tiles with sides of `side` [m]. The caller builds the tiles. Observations do not change.
 
-    The overrides describe only one level tile, which is small enough for the check of the terrain's size.
+    The overrides describe only one level tile, so that they pass the check of the terrain's size.
     """
     return [
         ("terrain.mesh_type", "height_map"),

@@ -108,7 +108,7 @@ def hold(
     observations after each control step and returns name -> quantity (N, ...).
 
     Return the sums of these quantities over each robot's first episode, flags (N,) of the robots that fell in this episode,
-    and how often full memory made a robot lose contacts in a step. The sum "steps" (N,) counts the summed steps.
+    and the number of control steps with lost contacts, summed over robots. The sum "steps" (N,) counts the summed steps.
     """
     task.reset()
     observations = task.hold_commands(commands)
@@ -197,7 +197,7 @@ def estimation_errors(
     kind: type[BaseTask], names: Sequence[str], squares: Tensor, steps: Tensor
 ) -> dict[str, dict[str, Any]]:
     """Return name of an estimated term -> `rmse` and `unit`. `rmse` is the root mean square error over all robots and steps,
-    or None without a step. `squares` (N, terms) are sums of squared errors over the `steps` (N,) of each robot.
+    or None if no step was measured. `squares` (N, terms) are sums of squared errors over the `steps` (N,) of each robot.
     """
     count = float(steps.double().sum())
     means = (squares.double().sum(dim=0) / max(count, 1.0)).tolist()

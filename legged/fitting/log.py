@@ -54,8 +54,8 @@ class ActuatorLog:
 
     @property
     def held_out(self) -> np.ndarray:
-        """Return the mask (T,) of the samples that are held out from the fit, about a fifth of all. Whole runs are held
-        out, but every fifth block of time if there are fewer than five runs or one run has nearly all samples.
+        """Return the mask (T,) of the samples that are held out from the fit, about a fifth of all: whole runs or, if
+        there are fewer than five runs or one run has nearly all samples, every fifth block of time in each run.
         """
         runs, lengths = np.unique(self.run, return_counts=True)
         if len(runs) >= HELD_OUT:

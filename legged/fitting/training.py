@@ -33,7 +33,7 @@ def train_network(
     random = torch.Generator().manual_seed(seed)
     state = torch.get_rng_state()
     try:
-        torch.manual_seed(seed)  # for the initial weights
+        torch.manual_seed(seed)  # torch draws the initial weights from its global generator
         if kind == "mlp":
             network, loss = _mlp(log, inputs, torque, hidden, spacing * np.arange(samples), random)
         else:

@@ -63,7 +63,7 @@ class Constants:
                 before, after = parts[:place], parts[place:]
                 from_behind = any(other is Ellipsis for other in before)
                 dim = tensor.dim() - sum(map(_dimensions, after)) if from_behind else sum(map(_dimensions, before))
-                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # torch refuses short integers here
+                tensor = tensor[(*[slice(None)] * dim, part.view(1).long())]  # torch refuses int8 and int16 in an index
                 parts = (*before, 0, *after[1:])
         return tensor, parts if isinstance(index, tuple) else parts[0]
 
@@ -73,7 +73,7 @@ class Constants:
         if any(isinstance(part, list | tuple) and holds_tensors(part) for part in parts):
             raise HostReadError("indexes by a list of tensors: a CUDA graph cannot hold their values; use torch.stack")
         if isinstance(index, list) and any(not isinstance(value, int | np.integer | np.bool_) for value in index):
-            return index  # torch interprets most sequences as tuples and warns
+            return index  # torch reads most such lists as tuples, and warns
         pieces = tuple(piece for part in parts for piece in self._positions(tensor, index, part))
         return pieces if isinstance(index, tuple) or len(pieces) != 1 else pieces[0]
 

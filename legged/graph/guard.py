@@ -58,7 +58,7 @@ class ForbidHostReads:
     a tensor as an attribute and read it later in the same step, or outside the step. The first two runs may set up
     attributes.
 
-    The physics engines of this package are exempt. Those on the host work on numpy arrays, but are never captured.
+    The physics engines of this package are exempt. Engines on the host work on numpy arrays, but are never captured.
     """
 
     STEPS = 3
@@ -235,7 +235,7 @@ class Seen:
 
 
 def memory_of(value: Any) -> int | None:
-    """Return an identifier of a tensor's memory, or None for other values. Other referenced memory has other identifiers."""
+    """Return an identifier of a tensor's memory, or None for other values. Two memories in use never share an identifier."""
     return value.untyped_storage()._cdata if isinstance(value, Tensor) and value.layout is torch.strided else None
 
 
@@ -303,7 +303,7 @@ class _Operators(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        with self:  # in inference mode composite operators, such as item, arrive in one piece
+        with self:  # in inference mode torch does not split composite operators, such as item
             result = func.decompose(*args, **kwargs)
         if result is not NotImplemented:
             return result
@@ -383,7 +383,7 @@ class _Calls(TorchFunctionMode):
             return func(*args, **kwargs)
         if device is None:
             self._guard.refuse(f"torch.{func.__name__} without a device makes a tensor on the CPU: {ON_THE_DEVICE}")
-        elif self._is_host(device) and not caller().startswith("legged."):  # legged's learner names the CPU by a string
+        elif self._is_host(device) and not caller().startswith("legged."):  # legged's own learner may use the CPU
             self._guard.refuse(f"torch.{func.__name__} makes a tensor on the CPU: {ON_THE_DEVICE}")
         elif func in self.OF_DATA:
             return self._constant(func, given[0], args, kwargs, (device,))

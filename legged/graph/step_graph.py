@@ -12,7 +12,7 @@ __all__ = ["Branch", "ForbidHostReads", "ForbidReads", "HostReadError", "StepGra
 
 
 class Branch:
-    """Part of the step that runs in parallel to the rest of the step: on a GPU a second stream, in a CUDA graph a branch.
+    """Part of the step that runs in parallel to the rest: in a second stream on a GPU, in a branch of a captured CUDA graph.
 
     The step's small kernels are bound by latency, so kernels in a parallel branch cost nothing. Tensors that both streams use
     must be allocated before `fork`, because one stream may reuse memory that the other still reads. Call `join` before the

@@ -8,7 +8,7 @@ from torch import Tensor
 
 class AsyncReadback:
     """Snapshot of some tensors, copied to the host in one transfer. Work that is launched after the constructor does not
-    change it.
+    change the snapshot.
     """
 
     @torch.no_grad()

@@ -106,7 +106,7 @@ class CapturedRunner(Runner):
             if saves:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
             if saves or evaluates:
-                clock = None  # a new clock leaves out the time of saving and evaluation
+                clock = None  # the next clock starts anew, to leave out the time of saving and evaluation
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()

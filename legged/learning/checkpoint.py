@@ -120,8 +120,8 @@ INFOS: dict[str, Kind] = {
 
 
 def _check_kind(where: str, found: Mapping[str, Any], kinds: Mapping[str, Kind]) -> None:
-    """Raise ConfigError if an entry of `found` has the wrong type. Missing entries are allowed here; the code that reads an
-    entry checks for it.
+    """Raise ConfigError if an entry of `found` has the wrong type. Missing entries are allowed, because the code that reads
+    an entry checks that it exists.
     """
     for key, kind in kinds.items():
         if key not in found:
@@ -226,7 +226,7 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     described = {}
     for name in NETWORKS:
         read = groups_of(cfg, name)
-        own = {"observations": list(read), "history": groups[read[0]].history}  # old versions read these entries
+        own = {"observations": list(read), "history": groups[read[0]].history}  # older versions of legged read these entries
         hidden = list(getattr(policy, f"{name}_hidden_dims"))
         described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described

@@ -107,7 +107,7 @@ class Evaluations:
         return improved
 
     def _judge(self, found: Evaluated) -> None:
-        """Set `why_end` if the target is reached, or if the listener gives a reason."""
+        """Set `why_end` if the target is reached, or if the function `listener` returns a reason."""
         target = self._runner.stop_at
         if target and all(reaches(name, found.figures[name], value) for name, value in target.items()):
             self.reached = True
@@ -130,8 +130,8 @@ class Evaluations:
         return lines
 
     def go_on_from(self, checkpoint: Path) -> None:
-        """Take over the best policy of the resumed run, unless this policy is newer than `checkpoint` or was chosen by
-        another figure.
+        """Take over the best policy of the resumed run, unless that policy is newer than `checkpoint` or has no value of the
+        figure `best_by`.
         """
         path = checkpoint.with_name(BEST_MODEL)
         try:

@@ -1,7 +1,7 @@
 """Task and settings from the command line of a training, stored in the run folder as given.json.
 
-A user-defined task is found only if the module or YAML file that defines it is known. So the commands in a report name this
-module or file. A report on a task that can't be found shows the settings of the command line.
+A user-defined task is found only if the module or YAML file that defines it is known. So the commands in the report of a run
+name this module or file. If the task can't be found, the report shows the settings of the command line.
 """
 
 import json
@@ -45,7 +45,7 @@ def write_invocation(folder: Path, invocation: Invocation, before: Path | None =
     """
     earlier: Mapping[str, Any] = {}
     if before is not None:
-        with suppress(ConfigError):  # a damaged file is skipped here and named in the report on that run
+        with suppress(ConfigError):  # a damaged file is skipped; the report of that run names it
             earlier = (read_invocation(before) or invocation).changes
     said = {"task": invocation.task, "import": invocation.module, "changes": {**earlier, **invocation.changes}}
     write_text(folder / INVOCATION_FILE, json.dumps(said, indent=1, default=str) + "\n")

@@ -156,8 +156,8 @@ def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> 
 
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
-    """Update the running mean and variance with the samples `x` (n, width) of all processes, as rsl-rl does. The tensors are
-    updated in place, because a graph needs fixed addresses.
+    """Update the running mean and variance with the samples of all processes, as rsl-rl does. `x` (n, width) holds those
+    of this process. The tensors are updated in place, because a graph needs fixed addresses.
     """
     mean, variance = x.mean(dim=0, keepdim=True), x.var(dim=0, unbiased=False, keepdim=True)
     count = len(x)

@@ -245,7 +245,7 @@ class DevicePPO(CriticWarmup):
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
-        """Return a random permutation of `count` samples, from a sort of random numbers. A CUDA graph can hold this sort."""
+        """Return a random permutation of `count` samples, found by sorting random numbers. A CUDA graph can hold a sort."""
         return torch.rand(count, device=self.device).argsort()
 
     def _step(
@@ -262,7 +262,7 @@ class DevicePPO(CriticWarmup):
         targets: Tensor | None = None,
     ) -> Tensor:
         """Adapt the learning rate and take a gradient step on one mini-batch. Return its losses in the order of `LOSSES`, its
-        estimation errors, and 1. If a gradient or the value loss is NaN or infinite, take no step and return zeros.
+        estimation errors, and a count of 1. If a gradient or the value loss is NaN or infinite, return zeros without a step.
         """
         samples = len(old_mean)
         if self.normalize_advantage_per_mini_batch:
@@ -296,7 +296,7 @@ class DevicePPO(CriticWarmup):
             losses.append((mean[samples:] - images[samples:]).square().mean())
 
         kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
-        losses.insert(LOSSES.index("kl"), kl)  # below, `average_` averages this tensor over all processes
+        losses.insert(LOSSES.index("kl"), kl)  # below, `average_` writes the mean over all processes into `kl`
         # If the critic returns NaN, the gradient of the clipped value loss may be finite, so the loss is checked as well.
         valued = value_loss.detach().clone()
         if self._critic_alone:
@@ -318,8 +318,8 @@ class DevicePPO(CriticWarmup):
         return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
 
     def _step_critic(self, figures: list[Tensor], valued: Tensor) -> Tensor:
-        """Take a gradient step of the value function alone. Return `figures` and 1, or zeros if the value loss `valued` () or
-        a gradient is NaN or infinite.
+        """Take a gradient step of the value function alone. Return `figures`, followed by a count of 1; or return zeros if
+        the value loss `valued` () or a gradient is NaN or infinite.
 
         The actor's gradients are set to None, because the optimiser skips parameters without a gradient. With zero gradients
         Adam would count a step, and the first real steps of the actor would then be too large.
@@ -330,7 +330,7 @@ class DevicePPO(CriticWarmup):
         fine = (self._clip_gradients() + valued) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        for parameter, gradient in of_actor:  # with several processes, `gradient` is a view of the shared buffer
+        for parameter, gradient in of_actor:  # restored: with several processes, gradients are views of a shared buffer
             parameter.grad = gradient
         return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
 

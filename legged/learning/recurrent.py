@@ -71,7 +71,7 @@ class Memory:
         self.parts = [*hidden_states({"": network}, num_envs).values()] if parts is None else parts
 
     def copy(self, parts: list[Tensor]) -> "Memory":
-        """Return a Memory of the same network that holds `parts`."""
+        """Return a Memory that holds `parts`, for the same network."""
         return Memory(self.network, 0, [*parts])
 
     def act(self, inputs: Tensor) -> Tensor:

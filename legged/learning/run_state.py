@@ -1,4 +1,4 @@
-"""State of a training that its checkpoint does not hold: random generators, robots, episodes. With this state a resumed
+"""Part of a training's state that is not in the checkpoint: random generators, robots, episodes. With this state a resumed
 training continues as if it had never stopped. Without this state, robots start anew.
 
 The state's size grows with the number of robots, so only the newest state is kept: state_<iteration>.pt next to

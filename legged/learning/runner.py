@@ -1,4 +1,4 @@
-"""Runner that extends rsl-rl's OnPolicyRunner with atomic checkpoints, which hold the task's state, and a clean stop."""
+"""Runner that extends rsl-rl's OnPolicyRunner by a clean stop, and by atomic checkpoints that hold the task's progress."""
 
 import contextlib
 import io
@@ -179,8 +179,8 @@ class Runner(OnPolicyRunner):
         try:
             self.learn(until_iteration - self.current_learning_iteration, init_at_random_ep_len=True)
         except (Interrupted, Ended) as end:
-            # Only the first process has evaluations, but all get Ended. With several processes, Ended always means that the
-            # target is reached.
+            # Only the first process has evaluations, but the logger raises Ended in all processes. With several processes,
+            # Ended always means that the target is reached.
             finished = isinstance(end, Ended) and (self.evaluations is None or self.evaluations.reached)
             if self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -291,7 +291,7 @@ class Runner(OnPolicyRunner):
         parts = {"optimizer": "optimizer_state_dict" in saved, **parts}
         if parts["optimizer"]:
             wanted, where = saved["optimizer_state_dict"], f"{relative(path)}: its optimiser"
-            waiting = len([*self.alg.get_policy().parameters()])  # a critic warm-up creates no moments of the policy
+            waiting = len([*self.alg.get_policy().parameters()])  # they have no moments after a critic warm-up
             saved["optimizer_state_dict"] = fit_optimizer(wanted, self.alg.optimizer, where, waiting)
         try:
             self.alg.load(saved, parts, strict)

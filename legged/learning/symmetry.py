@@ -25,7 +25,7 @@ def images_of(task: BaseTask) -> MirrorImages:
 def augment(
     images: MirrorImages, env: BaseTask, obs: TensorDict | None, actions: Tensor | None
 ) -> tuple[TensorDict | None, Tensor | None]:
-    """Append its mirror image to a batch: (n, ...) -> (2 n, ...). rsl-rl's symmetry extension calls this function, with
+    """Append to a batch its mirror image: (n, ...) -> (2 n, ...). rsl-rl's symmetry extension calls this function, with
     `images` already bound.
     """
     seen = done = None

@@ -128,7 +128,7 @@ def _observed_as(cfg: TaskConfig, name: str) -> str:
 
 
 def _largest_forces(cfg: TaskConfig) -> str:
-    """Return as text the largest value of each observed force. Observations of forces are shares of it."""
+    """Return as text the largest value of each observed force. A force is observed as a share of this value."""
     forces = observed_forces(cfg) if isinstance(cfg, LeggedConfig) else {}
     return ", ".join(f"{name} up to {largest_of(force):g} N" for name, force in forces.items()) or "none"
 

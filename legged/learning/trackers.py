@@ -98,7 +98,7 @@ class _Plain:
 
 
 class Tracker(LogWriter):
-    """Writer to TensorBoard and a tracker. A tracker's first failure gives a warning; then it is not used any more."""
+    """Writer to TensorBoard and a tracker. After its first failure and a warning, a tracker is not used any more."""
 
     def __init__(self, writer: LogWriter, folder: str) -> None:
         """Take the tracker's `writer`, which may write TensorBoard's file itself, as rsl-rl's writers do."""

@@ -131,7 +131,7 @@ def _check_observations(
     steps_there: Mapping[str, int],
     networks: Iterable[str],
 ) -> None:
-    """Compare the observation groups that `networks` read, term by term: the task's (`here`) and the checkpoint's (`there`).
+    """Compare term by term the observation groups that `networks` read: the task's (`here`) and the checkpoint's (`there`).
 
     Raises:
         ConfigError: groups differ. The text gives the first difference of each group.

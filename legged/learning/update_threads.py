@@ -7,8 +7,8 @@ from contextlib import contextmanager
 import torch
 
 SLOWER = 1.3
-"""Other programs seem to keep the cores busy if an update with all threads takes more than this factor
-times the best such time so far."""
+"""If an update with all threads takes more than this factor times the time of the fastest one so far, other programs seem to
+keep the cores busy."""
 LOOK_AGAIN = 20
 """After this number of updates with one thread, all threads are tried again."""
 

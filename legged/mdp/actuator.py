@@ -3,8 +3,8 @@
 The torque-speed line is that of a direct-current motor: its torque falls from the stall torque at rest to zero at the no-load
 speed (any textbook; Isaac Lab's DCMotor, mjlab's dc_actuator and Newton's ClampingDCMotor have the same line).
 Friction is Coulomb and viscous friction with the Stribeck effect, after Armstrong-Helouvry, Dupont, Canudas de Wit, "A survey
-of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994). Here
-friction is smoothed near zero speed.
+of models, analysis tools and compensation methods for the control of machines with friction", Automatica 30 (1994). This
+module also smooths friction near zero speed.
 """
 
 import math
@@ -325,7 +325,7 @@ def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where:
 
     Raises:
         ConfigError: a pattern matches no joint, a no-load speed is missing, a motor is too strong for the physics step, or
-            the network's file is missing or invalid, or needs the P law or another physics step.
+            the network's file is missing or invalid, or the network needs law P or another physics step.
     """
     actuator = cfg.actuator
     _check_line(with_rotors(robot, actuator, where), *motor_numbers(robot, actuator, where), sim_dt, where)

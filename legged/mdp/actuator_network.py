@@ -26,7 +26,7 @@ FORMAT = 1
 WIDEST, DEEPEST = 1024, 16
 """Largest number of units in a layer, and largest number of layers."""
 TOLERANCE = 1e-3
-"""Largest deviation of the time between samples from a whole number of physics steps, in physics steps."""
+"""Samples must be a whole number of physics steps apart. This is the largest allowed deviation, in physics steps."""
 
 
 @dataclass(frozen=True)

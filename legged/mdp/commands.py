@@ -49,7 +49,7 @@ class Commands:
         self.time_left = torch.zeros(num_envs, device=device)
         """(N,) time until the next command is sampled [s]."""
         self.held = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        """(N,) True for robots whose command was set by `hold`. It is not sampled any more."""
+        """(N,) True for robots whose command was set by `hold`. Such a command is not sampled any more."""
         self.steered = torch.ones(num_envs, dtype=torch.bool, device=device)
         """(N,) True for robots whose yaw rate steers towards their heading, in heading mode."""
         self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)

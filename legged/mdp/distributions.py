@@ -72,7 +72,7 @@ class Distributions:
         """Return the table of parameters (V, 8) and the index of each column's uniform number (V,).
 
         A row holds: the distribution's index in `KINDS`; middle and spread of a normal distribution, else 0; both ends of the
-        range; the widening in a step and the share at the first step, or 0 and 1 for a constant range; the neutral value.
+        range; its widening in a step and its width at the first step, as shares of its full width; the neutral value.
         """
         count, like = len(columns), self.low
         source = torch.tensor([self._order.index(i) for i in range(count)], device=like.device)

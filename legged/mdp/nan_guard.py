@@ -26,12 +26,12 @@ class NanGuard:
     STATE = ("sound",)
 
     def __init__(self, rewards: Sequence[str], observations: ObservationTerms, num_envs: int, device: torch.device) -> None:
-        """Watch the reward terms named `rewards` and the terms of `observations`. The rows of `check_rewards` have the order
-        of `rewards`.
+        """Watch the reward terms named `rewards` and the terms of `observations`. `check_rewards` takes a row for
+        each reward term, in the order of `rewards`.
         """
         self.outputs_finite = torch.ones(num_envs, dtype=torch.bool, device=device)
-        """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of the others end at
-        the next step."""
+        """(N,) True for robots whose rewards and observations of the last step were finite. The episodes of all other robots
+        end at the next step."""
         self.sound = self.outputs_finite
         """The tensor `outputs_finite`, under its name in saved states."""
         self._terms = observations

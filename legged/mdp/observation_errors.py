@@ -72,14 +72,14 @@ class ObservationErrors:
         half, width = by_column(bias), by_column(noise)
         self._bias_drawn = numbers.between(-half, half, len(columns)) if half.any() else None
         self.bias = torch.zeros(num_envs, len(columns) if self._bias_drawn else 0, device=device)
-        """(N, C) bias in this episode of the C columns that have errors; (N, 0) without bias."""
+        """(N, C) bias of the C columns that have errors, constant within an episode; (N, 0) without bias."""
         self._noise = numbers.between(-width, width, len(columns)) if width.any() else None
         low, high = (torch.tensor([delay.get(name, (0, 0))[k] for name in self.names], device=device) for k in (0, 1))
         self._longest = int(high.max())
         self._most = high
         self._delay_drawn = numbers.between(low.float(), high.float() + 1.0, len(high)) if self._longest else None
         self.delay = high.expand(num_envs, -1).clone()
-        """(N, T) delay in this episode of the T terms that have errors [control steps]."""
+        """(N, T) delay of the T terms that have errors, constant within an episode [control steps]."""
         self.past = torch.zeros(num_envs, self._longest + 1 if self._longest else 0, len(columns), device=device)
         """(N, steps, C) measurements of the last steps, newest first; (N, 0, C) without delay."""
         lost = torch.tensor([float(dropped.get(name, 0.0)) for name in self.names], device=device)

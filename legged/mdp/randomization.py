@@ -127,8 +127,8 @@ class Randomization:
         self._even = self._own.ask(numbers) if self._own is not None else None
         self._choice = numbers.between(0.0, float(VARIANTS), 1) if self.chosen_fields else None
         self._new_chosen = torch.zeros(worlds, dtype=torch.long, device=device)
-        # `place` is each column's index among new values, which are in `order`. `moment` says when a column gets new values:
-        # 0 means never, 1 means at resets, and 2 + k means every `intervals[k]` seconds.
+        # `order` lists the fields of the new values; `place` is each column's index among these values. `moment` says when a
+        # column gets new values: 0 means never, 1 means at resets, and 2 + k means every `intervals[k]` seconds.
         intervals = sorted({self.draws[name].interval_s for name in self.redrawn if self.draws[name].when == "interval"})
         order, place, moment = [*own, *self.chosen_fields], [], []
         starts = dict(zip(order, accumulate((widths[name] for name in order), initial=0), strict=False))

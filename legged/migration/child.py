@@ -1,7 +1,7 @@
 """Program that runs the configuration of a legged_gym fork and prints the values, methods and terrain types as JSON.
 
-`reading.py` starts this program as a child process. The program imports nothing of this package. Stand-ins replace modules
-that are not installed, and the modules in `REPLACED` in any case. Any use of a stand-in gives another stand-in.
+`reading.py` starts this program as a child process. The program imports nothing of this package. Stand-ins replace the
+modules in `REPLACED`, and modules that are not installed. Any use of a stand-in gives another stand-in.
 """
 
 import abc
@@ -44,7 +44,7 @@ INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<f
 READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
 """Name -> pattern that is searched for in the text of a method."""
 CUT = "(cut)"
-"""Name of a stand-in for columns of a `torch.cat` result. It is not known which of the joined parts they belong to."""
+"""Name of a stand-in for columns of a `torch.cat` result, if it is unknown which joined parts the columns come from."""
 CALLS: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
 """Calls of stand-ins: name, and arguments."""
 KNOWN: dict[str, Any] = {}
@@ -230,7 +230,7 @@ def registered() -> dict[str, tuple[Any, Any, Any]]:
 
 
 def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str, type]:
-    """Return the classes of a module that have a section of one of these names."""
+    """Return the classes of a module that have a section named in `names`."""
     return {
         key: value
         for key, value in vars(module).items()
@@ -239,8 +239,8 @@ def with_sections(module: types.ModuleType, names: tuple[str, ...]) -> dict[str,
 
 
 def configurations(module: types.ModuleType) -> dict[str, type]:
-    """Return the environment configurations that a module defines. If the module defines none and imports only one, each
-    function `config_*` of the module changes the imported class into a configuration.
+    """Return the environment configurations that a module defines. If it defines none and imports exactly one, call the
+    module's functions `config_*`, which change the imported configuration, and return it under the functions' names.
     """
     learners = with_sections(module, LEARNER_SECTIONS)
     classes = {name: value for name, value in with_sections(module, SECTIONS).items() if name not in learners}
@@ -368,8 +368,8 @@ def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str
 
 
 def environment_classes(task_class: Any, root: Path) -> list[type]:
-    """Return the class of the task. If no registry names one, return all classes with rewards in the package or next to the
-    file.
+    """Return the task's class if a registry names it. Otherwise, return all classes with rewards in the package, or in the
+    folder of a file outside any package.
     """
     if isinstance(task_class, type):
         return [task_class]

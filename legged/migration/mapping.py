@@ -147,7 +147,7 @@ def _commands(result: Translation) -> None:
 
 
 def _contacts(result: Translation) -> None:
-    """Map self-collisions and friction. The ends of the friction range are averaged with the ground's, as in PhysX."""
+    """Map self-collisions and friction. As in PhysX, the friction range is averaged with the ground's friction."""
     own = result.get("domain_rand.friction_range", [])
     ground = result.get("terrain.static_friction", 1.0)
     if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
@@ -163,8 +163,8 @@ def _contacts(result: Translation) -> None:
 
 
 def _rewards(result: Translation, fork: Fork) -> None:
-    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale. A note lists the methods that
-    the user has to paste for them.
+    """Map the scales of rewards that have legged_gym's formula. All other rewards get no scale. For these,
+    a note lists the methods that the user has to paste.
     """
     known, prefix = LeggedRobot.terms("_reward_"), "rewards.scales."
     sigma, mapped, paste = "", set(), []
@@ -201,7 +201,7 @@ def _rewards(result: Translation, fork: Fork) -> None:
 
 
 def _observations(result: Translation, fork: Fork) -> None:
-    """Map the observations from the parts that compute_observations joins. If no class was found, guess from their number."""
+    """Map the observations that compute_observations joins. Without an environment class, guess them from their number."""
     numbers = [result.get(f"env.{name}") for name in ("num_observations", "num_privileged_obs")]
     history, one = (result.get(result.has(*names) or names[0]) for names in (tables.HISTORY, tables.ONE_STEP))
     if history is None and is_number(one) and is_number(numbers[0]) and one and numbers[0] % one == 0:

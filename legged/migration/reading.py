@@ -46,7 +46,7 @@ class Method:
 
     place: str
     original: bool
-    """True if it is legged_gym's method of that name."""
+    """True if the method is the same as legged_gym's method of that name."""
     reads: tuple[str, ...]
     """Names of `child.READS` that the method reads."""
 

@@ -37,8 +37,8 @@ def names_of(result: Translation) -> list[str]:
 
 
 def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
-    """Translate the fork's settings of the robot. Gains go to `result`; the others are returned as entries of a robot.yaml:
-    those that differ from `robot`, or all if `robot` is None.
+    """Translate the fork's settings of the robot. Write the gains to `result`. Return the other settings as
+    entries of a robot.yaml: all of them if `robot` is None, otherwise only those that differ from `robot`.
     """
     gains = {name: result.get(f"control.{name}", {}) for name in ("stiffness", "damping")}
     if result.get("control.use_actuator_network", False) or result.get("control.control_type") == "actuator_net":
@@ -124,7 +124,7 @@ def _contacts(
         except ConfigError:
             result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot} that collides")
             continue
-        # A pattern that is only in a body's name excludes feet, because the shape of a foot may be on the body of the shank.
+        # A pattern that is only in a body's name does not select feet, because a foot's shape may be on the shank's body.
         named = theirs == LISTS[0][0] or any(pattern in name for name in shapes.names)
         chosen = [i for i in indices if named or shapes.contact[i] not in shapes.feet]
         kept += [pattern] if len(chosen) == len(indices) else [shapes.names[i] for i in chosen]

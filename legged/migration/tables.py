@@ -73,7 +73,7 @@ RANDOM_MODEL = {
     "joint_friction": "joint_friction",
     "init_state.dof_pos_factor": "initial_joint_pos",
 }
-"""Property or setting of this package -> names in forks. In a fork randomize_<name> is the switch, and <name>_range or
+"""Property or setting of this package -> names in forks. In a fork, randomize_<name> is the switch, and <name>_range or
 randomize_<name>_range is the range. If the range has another name, that name follows after a colon."""
 HISTORY = (
     *("env.frame_stack", "env.obs_history_length", "env.num_observation_history"),

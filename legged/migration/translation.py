@@ -15,7 +15,7 @@ from legged.migration.reading import Found
 
 DEFAULTS = to_dict(LeggedConfig())
 LIKE_DEFAULTS = {"commands.ranges.heading": [-3.14, 3.14], "train.runner.experiment_name": "test"}
-"""Setting of this package -> legged_gym's default. It counts as equal to the default of this package."""
+"""Setting of this package -> legged_gym's default, which counts as equal to the default of this package."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Translation:
     done: set[str] = field(default_factory=set)
     """Dotted paths of the file's settings that were handled."""
     notes: dict[str, list[str]] = field(default_factory=dict)
-    """Subject (rewards, observations, robot, ...) -> lines about it. They come first in the report."""
+    """Subject (rewards, observations, robot, ...) -> lines about the subject. The report begins with these lines."""
 
     def get(self, path: str, default: Any = None) -> Any:
         """Return the fork's value of the setting `path`, or `default` if the value is missing, unknown or of the wrong kind.
@@ -86,7 +86,7 @@ class Translation:
             self.lost.append(entry)
 
     def put(self, path: str, value: Any, theirs: str, comment: str = "") -> None:
-        """Set `path` to `value`, which comes from the fork's setting `theirs`. If `path` refuses it, record a loss."""
+        """Set `path` to `value`, which comes from the fork's setting `theirs`. If `value` is not allowed, record a loss."""
         self.done.add(theirs)
         try:
             build(LeggedConfig, nest(path, value), "", Origins(), "value")
@@ -98,7 +98,7 @@ class Translation:
         if default is None and path.startswith("observations.scales."):
             default = 1.0
         if value in (default, LIKE_DEFAULTS.get(path, default)):
-            self.settings.pop(path, None)  # another setting of the fork may have set it
+            self.settings.pop(path, None)  # another setting of the fork may have set `path`
             return
         self.settings[path] = copy.deepcopy(value)  # YAML would write a repeated list as an alias
         if comment:

@@ -50,9 +50,6 @@ class Physics(ABC):
     step computes all parts, or if the engine has no fused step."""
     why_c_engine: str = ""
     """Reason why `sim.physics=auto` chose the C engine for `MANY_WORLDS` or more worlds. Empty in all other cases."""
-    fitted: str = ""
-    """Description of the simple shapes that replace meshes, because the terrain collider does not support meshes. Empty if
-    no mesh was replaced."""
     compiled: int = 0
     """Number of kernel modules that were not in the cache and were compiled for this physics."""
     overflowed: Tensor

@@ -139,9 +139,9 @@ class _Level:
 class FeetKinematics:
     """Forward kinematics of the feet in torch.
 
-    After a step, an engine's own kinematics are those of the step's start. Here the kinematics are computed from the current
-    joint state, without a call of the engine. The last dimension of all arrays counts worlds, because the computation takes
-    twice as long if the last dimension counts x, y and z.
+    After a step, an engine's own kinematics are those of the step's start. This class computes the kinematics from the
+    current joint state, without a call of the engine. The last dimension of all arrays counts worlds, because the
+    computation takes twice as long if the last dimension counts x, y and z.
     """
 
     def __init__(self, model: mujoco.MjModel, robot: Robot, qpos: Tensor, qvel: Tensor) -> None:

@@ -10,7 +10,7 @@ POINTS = 1024
 
 def kept_speed(ratio: float) -> float:
     """Return the restitution of a body on a spring and damper with damping ratio `ratio` (0 to 1): the share of its speed
-    that it keeps after an impact. The contact ends when its force would begin to pull.
+    that it keeps after an impact. The contact ends when the contact force would begin to pull.
 
     Source: Schwager and Poeschel, Coefficient of restitution and linear-dashpot model revisited (Granular Matter 9, 2007),
     equation 21: exp(-r / w * angle) with w = sqrt(1 - r^2) and angle = atan2(2 r w, 2 r^2 - 1); exp(-2) at r = 1.

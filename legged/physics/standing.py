@@ -17,7 +17,7 @@ COSTLY_CONTACTS = {"cone": "elliptic", "impratio": 100.0}
 
 def height_under_gains(robot: Robot, stiffness: np.ndarray, damping: np.ndarray) -> float:
     """Simulate a robot on a plane for two seconds. PD control with the gains `stiffness` and `damping` (D,) holds the default
-    pose. Return the final height of the base [m], or 0 if the motion diverges. The stiffness of a wheel brakes its rotation.
+    pose. Return the final height of the base [m], or 0 if the motion diverges. A wheel's stiffness is a gain on its speed.
     """
     sim = SimConfig(**COSTLY_CONTACTS)  # type: ignore[arg-type]
     model = RobotScene(robot).model(sim)

@@ -42,7 +42,7 @@ SMALLER: tuple[tuple[int, float], ...] = (
     *((96, 1.0), (64, 1.0), (48, 1.0), (48, 0.92), (48, 0.84), (48, 0.76)),
     *((40, 0.7), (40, 0.6), (32, 0.5), (24, 0.4), (16, 0.3)),
 )
-"""Number of colours and scale of a GIF; the pairs are tried in this order until the GIF is small enough."""
+"""Pairs (number of colours, scale) of a GIF. They are tried in this order until the GIF is small enough."""
 
 
 class Video:

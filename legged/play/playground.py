@@ -40,8 +40,8 @@ class Playground:
 
     @classmethod
     def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
-        """Return the playground for --terrain (`name`) and --difficulty. It has COLUMNS columns of the type `name`. If `name`
-        is None, it has a column for each terrain type of the task, or is None for a task on a plane.
+        """Return the playground for --terrain (`name`) and --difficulty. It has COLUMNS columns of the type `name`. Without
+        `name` it has one column for each terrain type of the task. Without `name`, for a task on a plane, return None.
 
         Raises:
             ConfigError: the type or the difficulty does not exist.
@@ -63,7 +63,7 @@ class Playground:
             order = sorted(range(len(columns)), key=lambda c: -shares[columns[c]])
 
         def size(kind: str, usual: float) -> float:
-            """Return a tile's size at `difficulty` or, if that is None, the training's size at the difficulty `usual`."""
+            """Return a tile's size at `difficulty`. If that is None, return the task's size at the difficulty `usual`."""
             if difficulty is None:
                 return tile_size(cfg.terrain, kind, usual)
             return TERRAIN_TYPES[kind].sized(difficulty, cfg.terrain.scale)
@@ -106,7 +106,7 @@ class Playground:
         task.terrain_curriculum.place_at(torch.zeros_like(columns), columns)
 
     def label(self, terrain: Terrain, base_pos: Sequence[float]) -> str:
-        """Return the name of the tile below or nearest to `base_pos` (x, y, ...): 'stairs_up, step height 0.194 m'."""
+        """Return the name of the tile below or nearest to `base_pos` (x, y, ...), e.g. 'stairs_up, step height 0.194 m'."""
         tiles = np.round((np.array(base_pos[:2]) - terrain.origins[0, 0, :2]) / terrain.tile_size)
         row, column = np.clip(tiles, 0, np.array(terrain.origins.shape[:2]) - 1).astype(int)
         return label(self.rows[row][column].type, [self.rows[row][column].size])
@@ -120,6 +120,6 @@ class Playground:
 
 
 def label(kind: str, sizes: Sequence[float]) -> str:
-    """Return a text for tiles of one type with these sizes: 'stairs_up, step height 0.14 to 0.194 m'."""
+    """Return a text for tiles of one type with these sizes, such as 'stairs_up, step height 0.14 to 0.194 m'."""
     info = TERRAIN_TYPES[kind]
     return kind if kind == "flat" else f"{kind}, {info.what} {info.text(*sizes)}"

@@ -42,7 +42,7 @@ FRAMES = ("base frame", "yaw frame", "world frame")
 
 def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any]:
     """Return the observation layout with units, frames and formulas, the joints, the control law and time steps. Keys are
-    never renamed. The noise is that of `trained`, the configuration of the training. If it is None, the noise is the task's.
+    never renamed. The noise is that of `trained`, the configuration of the training. If `trained` is None, it is the task's.
     """
     cfg = task.cfg
     groups: list[dict[str, Any]] = []

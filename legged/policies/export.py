@@ -217,7 +217,7 @@ def weights_of(policy: Any, activation: str, num_actions: int) -> bytes:
 
 
 def _dense(mlp: nn.Sequential, activation: str, outputs: int | None = None) -> list[Layer]:
-    """Return the layers of an MLP; the last layer keeps only its first `outputs`, the means of the actions."""
+    """Return the layers of an MLP. If `outputs` is given, the last layer keeps only its first `outputs` outputs."""
     layers: list[Layer] = []
     linear = [module for module in mlp if isinstance(module, nn.Linear)]
     for module in linear:

@@ -94,7 +94,7 @@ def choose() -> None:
             context.GLContext()  # for a missing library, MuJoCo has a placeholder that raises an error
     except Exception as error:  # each library fails in its own way
         if isinstance(error, ModuleNotFoundError) and error.name == "mujoco":
-            return  # a robot's computer needs no MuJoCo, because it draws nothing
+            return  # nothing is drawn without MuJoCo, e.g. on a robot's computer
         works = off_screen_library()
         instead = f"{works} may work" if works and works != value else "no other library for drawing was found"
         why = " ".join(str(error).split())

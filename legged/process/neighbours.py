@@ -15,7 +15,7 @@ FOLDER = "legged-trainings"
 """Folder in the machine's temporary folder; it has one folder for each device, with one file for each training."""
 ENDING = ".training"
 TURN = "looking"
-"""File that a process locks while it counts, so that only one counts at a time. Two would take each other for trainings."""
+"""File that a process locks while it counts. If two counted at once, each could take the other's locks for trainings."""
 PAUSE_S = 1.0
 """Shortest time between two counts during a training [s]."""
 
@@ -50,7 +50,7 @@ class Neighbours:
             self._lock = os.fdopen(descriptor, "wb")
             os.chmod(name, 0o644)
             lock_descriptor(descriptor, blocking=False)
-            # Other trainings look for this ending. So the file gets it only after it is locked.
+            # Other trainings delete unlocked files with this ending. So the file is renamed only after it is locked.
             self._path = Path(name).rename(f"{name}{ENDING}")
         self.look()
         return self

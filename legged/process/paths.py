@@ -59,8 +59,8 @@ def reason(error: OSError) -> str:
 
 
 def full_disk_in(error: BaseException) -> OSError | None:
-    """Return the error of a full disk that is `error` or one of its causes, or None. A library may raise an error of its
-    own because of a full disk.
+    """Return the error that reports a full disk: `error` or one of its causes. Return None if there is no such error. A
+    library may raise an error of its own because of a full disk.
     """
     found: BaseException | None = error
     while found is not None:

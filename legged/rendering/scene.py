@@ -110,8 +110,8 @@ def add_horizon(scene: mujoco.MjSpec, terrain: Terrain) -> None:
 
 
 def _paint(scene: mujoco.MjSpec, geom: mujoco.MjsGeom, span: float, lowest: float, cell: float | None) -> None:
-    """Give a box one colour, or a height field a texture, by its height. Colours change from -`span` to `span` [m]. Points of
-    a height field below `lowest` [m] count as hidden. With `cell`, the side of a terrain cell [m], the ground is checkered.
+    """Colour a box, or the texture of a height field, by height. Colours change from -`span` to `span` [m]. Points of a
+    height field below `lowest` [m] count as hidden. With `cell`, the side of a terrain cell [m], the ground is checkered.
     """
     if geom.type == mujoco.mjtGeom.mjGEOM_BOX:
         top = geom.pos[2] + geom.size[2]

@@ -83,7 +83,7 @@ def _model(terrain: Terrain, robot: Robot, count: int, height: int) -> mujoco.Mj
     scene.stat.extent, scene.stat.center = extent, [0, 0, 0]
     look.map.znear, look.map.zfar, look.map.shadowclip = 0.2, 6.0, 1.2
     scene.worldbody.add_light(
-        pos=-2.0 * extent * SUN,  # only things between the distances znear and zfar from here cast shadows
+        pos=-2.0 * extent * SUN,  # only things at distances from znear to zfar from the light cast shadows
         dir=SUN,
         type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
         diffuse=[0.62] * 3,
@@ -131,7 +131,7 @@ def draw_map(terrain: Terrain, levels: Sequence[str], path: Path) -> None:
     # On the map, x points upward and y to the left. The light comes from the upper left.
     heights = ground.heights[shown][::-1, ::-1]
     largest = max(float(np.abs(heights).max()), 0.05)
-    # The scale is about linear up to 0.25 m and logarithmic above, so that low steps are visible next to high ones.
+    # The colour scale is linear up to about 0.25 m and logarithmic above, so that low steps are visible next to high ones.
     scale, colors = AsinhNorm(linear_width=0.25, vmin=-largest, vmax=largest), colormaps["RdYlBu_r"]
     light = LightSource(azdeg=315, altdeg=45)
     shaded = light.shade(heights, colors, blend_mode="soft", norm=scale, vert_exag=2.0, dx=ground.cell, dy=ground.cell)

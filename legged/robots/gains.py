@@ -24,7 +24,7 @@ RATIO = 0.5
 SAG = 0.25
 """Largest deflection of a joint under the robot's weight [rad]."""
 SHIFT = 0.1
-"""Least P gain of a leg's joint, as a share of mass * g * h [1/rad]. With less, an ankle could not shift the weight."""
+"""Least P gain of a leg's joint, as a share of mass * g * h [1/rad]. With less gain an ankle could not shift the weight."""
 LARGEST_TARGET = 0.3
 """P gains are limited so that only targets at least this far from the joint's angle demand the whole torque [rad]."""
 TIME_STEP = 0.005
@@ -97,7 +97,7 @@ def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[i
 
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the joint-space inertia (V, V) of V degrees of freedom. `mj_forward` has to have filled `data` before."""
+    """Return the joint-space inertia (V, V) of V degrees of freedom. `mj_forward` must have filled `data`."""
     columns = np.zeros((model.nv, model.nv))
     for i, unit in enumerate(np.eye(model.nv)):
         mujoco.mj_mulM(model, data, columns[i], unit)

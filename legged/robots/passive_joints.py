@@ -88,7 +88,7 @@ class PassiveJoints:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(self.model, data)
         mujoco.mj_comPos(self.model, data)
-        mujoco.mj_makeConstraint(self.model, data)  # makes no contacts, as no collisions were computed
+        mujoco.mj_makeConstraint(self.model, data)  # no contacts are made, because no collisions were computed
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
         if len(rows):

@@ -41,7 +41,7 @@ class RobotFile:
     feet: tuple[str, ...] = field(metadata=NAMES)
     """Patterns of the feet's shapes. All of these shapes on one body form one foot."""
     stiffness: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
-    """Joint-name pattern -> P gain [N m/rad]; if the table is empty, gains.py computes them from inertia and weight."""
+    """Joint-name pattern -> P gain [N m/rad]; if the table is empty, gains.py computes the gains from inertia and weight."""
     damping: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Joint-name pattern -> D gain [N m s/rad]; if the table is empty, gains.py computes the gains."""
     velocity_limit: dict[str, float] = field(default_factory=dict, metadata=positive(LARGEST))

@@ -30,7 +30,7 @@ class Shapes:
 
     @classmethod
     def of(cls, model: mujoco.MjModel, feet: Sequence[str], where: str) -> "Shapes":
-        """Return the shapes of a model. The patterns `feet` match the feet's shapes. All of these on one body form one foot.
+        """Return the shapes of a model. The patterns `feet` match shapes of feet. All such shapes on one body form one foot.
 
         Raises:
             ConfigError: a pattern matches neither shape nor body; `where` is the place of the patterns.

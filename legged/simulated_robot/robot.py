@@ -39,7 +39,7 @@ def motors_config(
     robot: Robot, contract: Contract | None, ideal: bool, changes: Iterable[tuple[str, Any]], dt: float
 ) -> tuple[ActuatorConfig, float]:
     """Return the configuration of the motors, and the time unit of their delay [s]. The motors are those with
-    which the policy of `contract` was trained, or ideal ones without a contract or if `ideal` is True. Then `changes` to
+    which the policy of `contract` was trained. They are ideal if there is no contract or `ideal` is True. Then `changes` to
     control.actuator are made. The time unit is the physics step of the training, or `dt` [s] without a contract.
 
     Raises:

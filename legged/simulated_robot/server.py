@@ -18,7 +18,7 @@ POSE_S = 0.04
 """Interval between the poses that are kept for a film [s]. At most `MOST_POSES` poses are kept."""
 MOST_POSES = 750
 SOURCE_S = 0.02
-"""Interval between states that include the sources [s], rounded to a multiple of the interval between states."""
+"""Interval between states that include `Reading.sources` [s], rounded to a multiple of the interval between states."""
 HOLD_S = 0.2
 """Time without a command after which motors brake with their present D gains [s]."""
 BEHIND_S = 0.1
@@ -121,7 +121,7 @@ class Server:
                         self._newest = 0
                     self._client = client  # this client receives the states from now on
                     self._socket.sendto(udp.packet(udp.FACTS, 0, udp.pack_facts(self.robot.facts)), client)
-            elif client == self._client and kind == udp.BYE:  # no loss is simulated here, so that the run always ends
+            elif client == self._client and kind == udp.BYE:  # BYE is never lost on purpose, so that the run always ends
                 self._gone = True
             elif client == self._client and kind == udp.COMMAND:
                 self._in.put(now, (sequence, body))

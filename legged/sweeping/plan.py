@@ -68,7 +68,7 @@ class SweepConfig:
     objective: ObjectiveConfig = ObjectiveConfig()
     """The objective."""
     pruner: Literal["median", "hyperband", "none"] = "median"
-    """Rule that ends trials early: if they are worse than the median of earlier trials, by successive halving, or never."""
+    """Rule for early ends of trials: `median` of earlier trials, `hyperband` (repeated successive halving), or `none`."""
     startup_trials: int = field(default=10, metadata=between(1, 1_000_000))
     """Number of random trials before earlier results guide the search."""
     seed: int = field(default=1, metadata=between(0, 2**31 - 1))
@@ -244,7 +244,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     if not runner.evaluate_interval:
         changes.append(("train.runner.evaluate_interval", max(1, runner.max_iterations // EVALUATIONS)))
     if "train.runner.evaluate_share" not in given.overrides:
-        # All evaluations are made, because trials are compared at equal iterations.
+        # Trials are compared at equal iterations, so no evaluation may be skipped to save time.
         changes.append(("train.runner.evaluate_share", 1.0))
     cfg = override(cfg, changes)
     parameters = tuple(_parameter(key, one, cfg, path) for key, one in given.parameters.items())

@@ -86,7 +86,7 @@ class Trials:
         """Store the `device` (cpu or cuda) on which trials are trained. If one is stored already, compare `device` with it.
 
         Raises:
-            ConfigError: earlier trials were trained on the other kind.
+            ConfigError: earlier trials were trained on the other kind of device.
         """
         known = self.study.user_attrs.get(DEVICE)
         if known is None:

@@ -117,7 +117,7 @@ def stairs(tile: Tile, riser: float, platform: float = 3.0, tread: float = TREAD
 
 def step(tile: Tile, height: float, platform: float = 3.0, ledge: float = LEDGE) -> None:
     """Make a raised ring around the platform. On the way outward it is one step up and, after the ledge, one step down."""
-    along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # cut to whole cells
+    along = max(1, tile.cells(ledge)) * tile.cell / tile.scale  # the ledge is cut to whole cells
     outer, inner = tile.middle(platform + 2.0 * along), tile.middle(platform)
     tile.heights[outer] = height
     tile.heights[inner] = 0.0
@@ -150,7 +150,7 @@ def stepping_stones(tile: Tile, stone: float, platform: float = 4.0, gap: float 
 
 def gap(tile: Tile, width: float, platform: float = 3.0) -> None:
     """Make a ditch around the platform."""
-    across = tile.cells(width / tile.scale) * tile.cell / tile.scale  # cut to whole cells
+    across = tile.cells(width / tile.scale) * tile.cell / tile.scale  # the ditch is cut to whole cells
     tile.heights[tile.middle(platform + 2.0 * across)] = -HOLE_DEPTH * tile.scale
     tile.heights[tile.middle(platform)] = 0.0
 

@@ -29,7 +29,7 @@ class HeightMap:
 
         `steepest` (X, Y) is a limit of the slope (rise over run) for each cell. Two cells have a vertical face between them
         if the slope between their centres exceeds the smaller one of their limits. legged_gym makes such faces in a triangle
-        mesh, with one limit for all types.
+        mesh, with the same limit everywhere.
         """
         return cls(heights, join(heights, cell * steepest), cell, origin)
 

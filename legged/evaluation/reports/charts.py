@@ -36,7 +36,7 @@ class Line:
     """A curve: x and y (n,); `band` is the lower and the upper edge (n,) of an area around it."""
 
     name: str
-    """Name in the legend. A line without a name is not in the legend; the page's script shows the chart's title for it."""
+    """Name in the legend. A line without a name is not in the legend. The page's script shows the chart's title for it."""
     x: np.ndarray
     y: np.ndarray
     band: tuple[np.ndarray, np.ndarray] | None = None
@@ -117,7 +117,7 @@ def draw_panel(axis: Any, chart: Chart) -> None:
         axis.plot(line.x, line.y, label=line.name or None, **look)
         if line.band is not None and len(line.x) > 1:
             axis.fill_between(line.x, *line.band, color=look["color"], alpha=0.15, linewidth=0)
-        elif line.band is not None:  # the area of a single point has no width
+        elif line.band is not None:  # a single point has no area, so the band is a vertical line
             axis.vlines(line.x, *line.band, color=look["color"], linewidth=1.0)
     dotted: dict[str, Any] = {"color": "0.25", "linestyle": ":", "linewidth": 1.4}
     if chart.level is not None:

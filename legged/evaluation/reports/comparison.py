@@ -1,5 +1,5 @@
 """Tables for the screen that compare evaluations, and a page that compares settings, curves and evaluations of runs. In the
-tables, evaluations with the same task, engine and conditions are taken as those of policies trained with different seeds.
+tables, evaluations with the same task, engine and conditions are assumed to be of policies trained with different seeds.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ from legged.evaluation.success import success_chart, success_line, types_in
 from legged.tables import screen_table
 
 Key = tuple[str, str, str]
-"""Task, engine, and conditions as text: changed fields, and the grid of commands if grids differ."""
+"""(task, engine, conditions). The conditions are the changed fields and, if the grids of the results differ, the grid."""
 Evaluations = dict[Key, list[dict[str, Any]]]
 """Key -> results, one for each seed."""
 FIGURES = {
@@ -47,9 +47,9 @@ FIGURES = {
 }
 """Label -> path in a result, factor, format."""
 Counted = dict[tuple[float, ...], float] | tuple[float, float, int] | tuple[int, int] | float | None
-"""A figure of a run: command -> error; (mean, sample standard deviation, count); (successes, trials); or a number."""
+"""A figure of a run: {command: error}, (mean, sample standard deviation, count), (successes, trials), a number, or None."""
 Measured = tuple[float, Interval | None] | None
-"""A figure and its confidence interval, which may be None. If a run lacks the figure, None stands for both."""
+"""A figure and its confidence interval, which may be None. If a run lacks the figure, the whole pair is None."""
 
 
 def keep_types(results: Sequence[dict[str, Any]], types: Sequence[str]) -> None:
@@ -126,7 +126,7 @@ def _heads(groups: Evaluations) -> list[str]:
 
 
 def _mean_text(values: Sequence[float], seeds: int, form: str, spread_text: str) -> str:
-    """Return the mean of `values` as text. Brackets hold `spread_text`, and the number of values if seeds have no value."""
+    """Return the mean of `values` as text. Brackets hold `spread_text`, and the number of values if some seeds have none."""
     notes = [spread_text] if len(values) > 1 else []
     notes += [f"of {len(values)} of {seeds} seeds"] if len(values) < seeds else []
     return f"{mean(values):{form}}" + (f" ({', '.join(notes)})" if notes else "")
@@ -229,7 +229,7 @@ def comparison_parts(records: Sequence[Record]) -> list[Part]:
 
 
 def apart(names: Sequence[str]) -> tuple[str, list[str]]:
-    """Split labels into their common parts and the rest of each label. If a rest is empty, labels are not split."""
+    """Split labels into their common parts and the rest of each label. If the rest of a label is empty, split nothing."""
     parts = [name.split(", ") for name in names]
     common = [part for part in parts[0] if all(part in one for one in parts)]
     rest = [", ".join(part for part in one if part not in common) for one in parts]

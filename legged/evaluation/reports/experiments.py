@@ -123,5 +123,5 @@ def _began(record: Record, beside: Path, ending: str) -> Cell:
 
 
 def _last(record: Record, tag: str) -> float | None:
-    """Return the running mean of a curve at its end; None if the curve was not logged."""
+    """Return the last value of a curve's running mean; None if the curve was not logged."""
     return float(smooth(record.scalars[tag][1])[-1]) if tag in record.scalars else None

@@ -33,7 +33,7 @@ LONGEST_VALUE = 60
 DEEPEST = 3
 """Number of levels of folders that are searched for runs: logs/, logs/<task>/ and logs/<task>/<run>/."""
 QUIET_S = 3600.0
-"""Time without new output after which a training counts as ended, even if a process with its id exists [s]."""
+"""Time without new output after which a training counts as ended [s], even if a process with its process id exists."""
 QUIET_ELSEWHERE_S = 120.0
 """Time without new output after which a training on another machine counts as ended [s]."""
 
@@ -244,7 +244,7 @@ def read_note(folder: Path) -> str:
 
 def from_task_file(record: Record) -> dict[str, list[Any]] | None:
     """Return setting -> [the run's value, the value in the task's files], for settings that differ; None if the run's task is
-    unknown. If the run's device is unknown, take the task's settings for CPU or for GPU: those that differ less from the run.
+    unknown. If the run's device is unknown, try the task's settings for CPU and for GPU, and return the shorter result.
     """
     where = [record.timing.device == "cpu"] if record.timing else [False, True]
     try:

@@ -47,7 +47,7 @@ REPORT = "report"
 ROWS = 10
 """Number of rows of the table that shows figures over the training."""
 LARGEST_FILM = 12 * 2**20
-"""Size of the largest film that the report shows [bytes]. Of a larger film it gives only the file name."""
+"""Size of the largest film that the report shows [bytes]. For a larger film the report gives only the file name."""
 LOG = "film.log"
 """Name of the file in a run folder with the output of the process that films the policy."""
 NICENESS = 10
@@ -186,7 +186,7 @@ def over_training(record: Record) -> Table:
     for step in picked:
         count = None if per_iteration is None else float((step + 1) * per_iteration)
         row: list[Cell] = [Number(f"{step + 1:,d}", float(step + 1)), number(count, ",.0f")]
-        for iterations, values, form in drawn:  # take the last value up to this iteration
+        for iterations, values, form in drawn:  # a row shows the last value up to its iteration
             before = values[iterations <= step]
             row.append(number(float(before[-1]) if len(before) else None, form))
         rows.append(row)

@@ -112,7 +112,7 @@ class Bench:
     ) -> None:
         """Prepare a test with `robots` robots for each line of the table. The steps of the stairs have the height `riser` [m]
         and the width `tread` [m], and `payload` is the mass on the base [kg]. `lines` are the names of the lines to measure.
-        By default the height is RISER times the scale, the payload is that of the table, and all lines are measured.
+        By default the height is RISER times `terrain.scale`, the payload is that of the table, and all lines are measured.
 
         Raises:
             ConfigError: the robot cannot be loaded, or an override randomises a property that the disturbances set.
@@ -242,8 +242,8 @@ def score(lines: Sequence[dict[str, Any]], ground: dict[str, Any]) -> dict[str, 
 
 def evaluate_stress(bench: Bench, full: bool) -> int:
     """Run the stress test, print the result, write stress_<physics>.json and .png, and return the exit code. With `full` all
-    lines are measured with every solver setting. If the bench has only some of the lines, there is no new ground and no
-    score, and solver settings are tried only with `full`.
+    lines are measured with every solver setting. If the bench has only some of the lines, new ground is not tested, the score
+    is None, and solver settings are tried only with `full`.
 
     Raises:
         RunError: a file can't be written.

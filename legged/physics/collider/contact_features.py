@@ -2,7 +2,7 @@
 capsules, and rim points and end discs of cylinders.
 
 A sphere has one point. A capsule has its two ends and the segment between them. A box has its corners. A cylinder touches a
-surface with the four points of its rims on which it would rest on a plane. This plane has the slope of the ground under the
+surface with four points of its rims: those on which it would rest on a plane with the slope of the ground under the
 cylinder's centre. The cylinder touches vertical faces and their rims with the discs at its ends and, like a capsule, with the
 segment between the ends.
 """
@@ -109,7 +109,7 @@ def around_disc(ground: Ground, centre: wp.vec3, axis: wp.vec3, radius: float, m
                 to[1] = to[1] + shift
             away = wp.length(to)
             dist = NOTHING
-            # A rim that is nearly perpendicular to the axis touches the cylinder only between its ends.
+            # A rim that is nearly perpendicular to the cylinder's axis cannot touch the disc, only the part between the ends.
             if wp.abs(along) > LENGTHWISE and away > 1e-6:
                 normal = -to / away
                 point = centre - normal * radius

@@ -1,8 +1,8 @@
 """All parts of a physics step except contacts and constraints, in one launch: poses, inertias, and the forces of motors,
 springs and gravity.
 
-mujoco-warp needs about twenty launches for this, and at 4096 worlds each launch costs microseconds however little it
-computes. Here each world has one warp of threads, and the quantities that bodies pass to their parents and children stay on
+mujoco-warp needs about twenty launches for this, and at 4096 worlds each launch costs microseconds even if it computes
+little. Here each world has one warp of threads, and the quantities that bodies pass to their parents and children stay on
 the chip. The algorithms are recursive Newton-Euler and composite rigid bodies (Featherstone, Rigid Body Dynamics Algorithms,
 2008), in MuJoCo's coordinates: spatial vectors are (angular, linear) in world axes about a tree's centre of mass; inertias
 are (xx, yy, zz, xy, xz, yz, m * offset, m).

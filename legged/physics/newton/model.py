@@ -86,7 +86,7 @@ def build_newton_model(
     layout = Layout.of(world, robot)
     scene = _builder(setup)
     scene.replicate(world, num_envs)
-    # Without self-collisions, shapes of the same world do not collide, so the ground is not part of a world.
+    # The ground belongs to no world, because without self-collisions, shapes of the same world do not collide.
     ground = newton.ModelBuilder.ShapeConfig(gap=setup.gap, mu=0.0 if setup.averages_friction else 1.0)
     if setup.springs is not None:
         ground.ke, ground.kd, ground.kf = setup.springs

@@ -51,7 +51,7 @@ class Simulation:
                 self.model, broad_phase="explicit", rigid_contact_max=capacity, **setup.pipeline
             )
         with warnings.catch_warnings():
-            # Newton warns if MuJoCo's version is not 3.17. This package requires 4.0, and its tests run Newton with that.
+            # Newton warns if MuJoCo's version is not 3.17. This package requires 4.0, and its tests run Newton with 4.0.
             warnings.filterwarnings("ignore", "MuJoCo dependency version mismatch", newton.NewtonWarning)
             self.solver = setup.make(self.model, sim)
         if terrain is not None and uses_cell_collider(setup, sim):

@@ -36,7 +36,7 @@ class SolverSetup:
     pipeline: dict[str, Any] = field(default_factory=dict)
     """Options of the collision pipeline."""
     maximal: bool = False
-    """True if the solver moves bodies only, so that joint angles must be computed from them after a step."""
+    """True if the solver only moves bodies. Joint angles must then be computed from the poses of bodies after a step."""
     register: Callable[[newton.ModelBuilder], None] | None = None
     """Function that adds the solver's own attributes to a builder."""
 

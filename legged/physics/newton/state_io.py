@@ -1,6 +1,6 @@
 """Conversion of states between Newton's conventions and the task's, and sums of contact forces on each shape.
 
-Newton's quaternions are (x, y, z, w). Its linear velocity is that of the body's centre of mass. Its linear and
+Newton's quaternions are (x, y, z, w). Newton's linear velocity is that of a body's centre of mass. Both linear and
 angular velocities are in the world frame. The task's arrays are in MuJoCo's layout: quaternions are (w, x, y, z), the linear
 velocity is that of the base's origin in the world frame, and the angular velocity is in the base frame.
 """

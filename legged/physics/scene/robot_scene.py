@@ -18,9 +18,9 @@ ROBOT, GROUND = 1, 2
 
 
 def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
-    """Return the robot without a ground. Some settings replace those of its file. Its shapes collide with the ground. With
-    `self_collisions`, they also collide with each other unless their bodies are neighbours. Contacts with the ground use the
-    friction of the robot's shapes, because this friction can be randomised. Joints have the rotor inertias of `robot`.
+    """Return the robot's model without a ground. It differs from the robot's file as follows. Shapes collide with the ground;
+    with `self_collisions`, they also collide with each other unless their bodies are neighbours. Contacts with the ground use
+    the friction of the robot's shapes, because this friction can be randomised. Joints have the rotor inertias of `robot`.
     """
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):

@@ -171,7 +171,7 @@ def _add_patch(add: _Geoms, x: slice, y: slice) -> None:
     for i, j, top in _rectangles(low, flat, add.overlap):
         add.box(slice(x.start + i.start, x.start + i.stop), slice(y.start + j.start, y.start + j.stop), top)
     for sloped in _layers(corners, ~flat):
-        # Height fields among boxes have no `skin`, because they would stick out of vertical faces. Points that belong to no
+        # Height fields among boxes have no `skin`, because a skin would stick out of vertical faces. Points that belong to no
         # sloped cell are lowered to the floor: the field then falls steeply inside the neighbouring boxes.
         i, j = (slice(int(at.min()), int(at.max()) + 1) for at in np.nonzero(sloped))
         points = _lattice(corners[i, j], sloped[i, j])[0]
@@ -182,10 +182,10 @@ def _layers(corners: np.ndarray, sloped: np.ndarray) -> Iterator[np.ndarray]:
     """Yield sets of cells (X, Y) that together are the `sloped` cells. Each set fits one height field: the cells of a set
     agree in the points that they share, and the field does not stick out above any other cell.
 
-    The first set leaves out all cells around two kinds of points. At the first kind, sloped cells differ in height. The
-    second kind lies above a corner of a cell that is not sloped, if the field would use at least three corners of this cell,
-    for example because slopes surround it. The cells that are left out are distributed over further sets. Between two cells
-    of such a set lie at least two other cells.
+    The first set leaves out all cells around two kinds of points. At points of the first kind, sloped cells differ in
+    height. Points of the second kind lie above a corner of a cell that is not sloped, but of which the field would use at
+    least three corners, for example because slopes surround the cell. The cells that are left out are distributed
+    over further sets. Between two cells of such a set lie at least two other cells.
     """
     points, bad = _lattice(corners, sloped)
     used = [~np.isnan(own) for own in _at_corners(points)]

@@ -38,7 +38,7 @@ class Launcher:
             inputs = [_of_torch(argument, k < vectors) for k, argument in enumerate(arguments)]
             wp.launch(kernel, dim=dim, inputs=inputs)
             if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
-                # The table fills up only if each step creates new tensors. Its launches are then useless, and are dropped.
+                # The table fills up only if each step creates new tensors. Old launches are then useless, and are dropped.
                 if len(self._prepared) >= MOST_PREPARED:
                     self._prepared.clear()
                 self._prepared[key] = prepared

@@ -215,7 +215,7 @@ def advance_map(
     holes: wp.array2d[wp.bool],
 ):
     """Update the errors of height maps. One thread per robot and map point, or per robot if maps have no holes. The last
-    column of `chances` decides if the whole map is lost.
+    column of `chances` decides whether the whole map is lost.
     """
     robot, point = wp.tid()
     fresh = wp.bool(begun[robot])

@@ -65,7 +65,7 @@ def read_kinematics(
     feet_vel: wp.array2d[wp.vec3],
     overflowed: wp.array[wp.bool],
 ):
-    """Compute the base's velocity and gravity in the base frame, the feet's positions and velocities, and the overflow flags.
+    """Compute base velocity and gravity direction in the base frame, positions and velocities of feet, and overflow flags.
     One thread per world and foot. `position` to `body_quat` are the fields of `FootChains`, (levels, feet) each.
     """
     world, foot = wp.tid()

@@ -204,7 +204,7 @@ def scan_heights(
     heights: wp.array2d[float],
     ground: wp.array[float],
 ):
-    """Read the heights of the points around each robot. One thread per robot and point; the last point is the base's
+    """Read the ground's heights at points around each robot. One thread per robot and point. The last point is the base's
     position.
     """
     robot, point = wp.tid()
@@ -277,8 +277,8 @@ def add_rewards(
     total: wp.array[float],
 ):
     """Add up the rewards of all terms. One thread per robot; each row of an array belongs to a term. The compiler moves no
-    read ahead of a write. So terms are processed in groups of four: all reads of a group come first, and wait for memory
-    together.
+    read ahead of a write. So terms are processed in groups of four. The values and sums of a group are read first, so
+    that these reads wait for memory at the same time.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)

@@ -250,8 +250,8 @@ def _joined(parts: list[Part]) -> trimesh.Trimesh:
 
 
 def terrain_mesh(terrain: Terrain) -> trimesh.Trimesh:
-    """Return a mesh of a terrain and of level ground around it, world frame [m]. It is the surface on which the C engine
-    computes collisions: steps with vertical faces, and smooth tiles. Colours are those of films.
+    """Return a mesh of a terrain and of level ground around it, world frame [m]. The mesh is the surface on which the C
+    engine computes collisions: steps with vertical faces, and smooth tiles. Colours are as in films.
     """
     scene = mujoco.MjSpec()
     add_painted_terrain(scene, terrain, checkered=True)

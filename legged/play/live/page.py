@@ -28,7 +28,7 @@ IDLE_S = 0.1
 SLOW = 0.9
 """Share of the chosen speed below which the page shows a warning."""
 KEYS = (("I", 0, 1), ("K", 0, -1), ("U", 1, 1), ("O", 1, -1), ("J", 2, 1), ("L", 2, -1))
-"""Keys that change the command: letter, axis and sign of the change. Viser's camera uses other letters and the arrows."""
+"""Keys that change the command: letter, axis and sign of the change. Viser's camera uses other letters and the arrow keys."""
 DIRECTIONS = {"forwards": 0.0, "left": 90.0, "backwards": 180.0, "right": -90.0}
 """Name of a push's direction -> angle from the robot's heading, positive to the left [degrees]."""
 
@@ -93,7 +93,7 @@ class Page:
     """
 
     def __init__(self, session: Session, host: str, port: int) -> None:
-        """Start the server at `host` and `port`, which `free_port` finds."""
+        """Start the server at `host` and at a `port` that `free_port` has returned."""
         viser = load_viser()
         from legged.play.live.drawing import Drawing  # imported here, because it needs trimesh, which comes with viser
 

@@ -35,7 +35,7 @@ Lines = tuple[dict[str, Any], ...]
 
 
 class History:
-    """The last K control steps (KEPT_S) of a robot with F feet, oldest first. A step that ended an episode is NaN."""
+    """The last K control steps (KEPT_S) of a robot with F feet, oldest first. Values of steps that end episodes are NaN."""
 
     def __init__(self, task: BaseTask) -> None:
         self.terms = task.rewards.names
@@ -145,7 +145,7 @@ def _line(name: str, color: str, dash: tuple[int, int] | None = None) -> dict[st
 
 
 def _reward_lines(names: Sequence[str]) -> Lines:
-    """Return uPlot's options for reward curves. A curve with the index LARGEST is the sum of the other terms."""
+    """Return uPlot's options for reward curves. A curve after the first LARGEST ones is the sum of the smaller terms."""
     return tuple(_line(name, COLORS[k]) if k < LARGEST else _line(name, OTHERS, DASH) for k, name in enumerate(names))
 
 
@@ -167,7 +167,7 @@ def gait_diagram(feet: Sequence[str], times: np.ndarray, contacts: np.ndarray, d
     """Return HTML with a row for each foot. Bars show the `times` (K,) [s] at which the foot's `contacts` (F, K) are 1."""
     rows = []
     for name, own in zip(without_common_words(feet), contacts, strict=True):
-        # Steps at which the foot comes down, or has just left the ground. A step covers the `dt` before its time.
+        # `a` is the first step of a contact, `b` the first step after it. The step at time t lasts from t - dt to t.
         edges = np.flatnonzero(np.diff(np.concatenate([[False], own > 0.5, [False]]).astype(int)))
         bars = "".join(
             f'<rect x="{times[a] - dt:.3f}" width="{times[b - 1] - times[a] + dt:.3f}" height="1" fill="{ACTUAL}"/>'

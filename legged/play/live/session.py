@@ -25,7 +25,7 @@ from legged.registry import make_task
 from legged.terrain import TERRAIN_TYPES, Terrain
 
 NEWEST = "newest"
-"""Choice that follows the newest checkpoint. The other choice, BEST, exists if the training evaluates its policy."""
+"""The choice to follow the newest checkpoint. The alternative is BEST, if the training evaluates its policy."""
 OWN, PLANE = "the task's own", "plane"
 """Kinds of ground other than a terrain type: tiles of all types of the task, and a plane."""
 HOURS_S = 36000.0
@@ -134,7 +134,7 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
     """Return overrides for `num_envs` undisturbed robots; the overrides in `asked` may disturb them."""
     if isinstance(cfg, LeggedConfig):
-        keep_length = len(grounds_of(cfg)) == 1  # on a single tile, episodes end before robots reach the edge
+        keep_length = len(grounds_of(cfg)) == 1  # the task's own length ends episodes before robots reach a tile's edge
         seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
         return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
     return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
@@ -304,7 +304,7 @@ class Session:
             self.problem = str(error)
 
     def place(self) -> str:
-        """Return a description of the ground below the followed robot: 'stairs_up, step height 0.194 m'."""
+        """Return a description of the ground below the followed robot, such as 'stairs_up, step height 0.194 m'."""
         if self.playground is None:
             return PLANE if self.kind == PLANE else ""
         return self.playground.label(self.task.terrain, self.task.base_pos[self.followed].tolist())

@@ -90,7 +90,7 @@ def take_gains(
     if not stated:
         return {}, {}
     damping = {hinge.name: float(hinge.damping or hinge.passive.get("damping", 0.0)) for hinge in stated}
-    if not any(damping.values()):  # `growth` would be 1, and rounding errors would decide
+    if not any(damping.values()):  # `growth` is then 1, and rounding errors would decide whether it exceeds 1
         tree.say("gains of the file's position actuators are left out: neither actuators nor joints have any damping")
         return {}, {}
     p, d = rule_gains(tree, angles, feet, height)

@@ -57,7 +57,7 @@ def _adapted(path: Path, _stamp: tuple[int, int], drawn: bool) -> tuple[str, tup
     """Return the MJCF of an adapted file, and one line for each change. `_stamp` renews the cache entry of a changed file."""
     tree = read_robot(path, drawn=drawn)
     bare = not tree.shapes
-    if bare and not drawn:  # visual shapes are read too, because copies of them will collide
+    if bare and not drawn:  # without collision shapes, read the visual shapes, because copies of them will collide
         tree = read_robot(path)
     fit_meshes(tree)
     if bare and not drawn:

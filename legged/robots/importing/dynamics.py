@@ -17,7 +17,7 @@ from legged.robots.importing.tree import Tree
 POSES = 8
 """Number of poses in which lost torques are computed."""
 SHARE = 0.1
-"""Largest torque that may be left out, in torque limits of the joint, and largest force on the base, in robot weights."""
+"""Largest share of a joint's torque limit, or of the robot's weight for the base, that may be left out."""
 LEVER = 0.1
 """Lever arm [m]. The robot's weight times this length stands in for the torque limit of joints without one."""
 ARRAYS = (

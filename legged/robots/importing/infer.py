@@ -24,7 +24,7 @@ from legged.robots.importing.wheels import find_wheels
 from legged.robots.stance import lowest_point, standing_height
 
 LIGHT = 0.005
-"""Finger joints that move less than this share of the robot's mass are held."""
+"""A finger's joint is held at one angle if the mass that it moves is less than this share of the robot's mass."""
 MIDDLE = 0.01
 """Largest distance of the origin of a trunk's link from the xz plane of the base [m]."""
 SOLE = re.compile(r"foot|feet|toe|sole|heel", re.IGNORECASE)
@@ -129,8 +129,8 @@ def _wheels(tree: Tree, legs: list[Leg], height: float) -> dict[str, float]:
 
 
 def _stand_on_all(tree: Tree, legs: list[Leg], angles: dict[str, float]) -> bool:
-    """Make a shape of a leg's last link a foot if it is about as low as the lowest shape of this link in the pose at `angles`
-    [rad]. Return True if any leg has more feet now.
+    """Add shapes of each leg's last link to its feet, if they are about as low as the link's lowest shape in the pose at
+    `angles` [rad]. Return True if any leg has more feet now.
     """
     poser = Poser(tree)
     data = poser.pose(angles)

@@ -199,7 +199,7 @@ def _ends(shape: Shape) -> list[Vector]:
 
 
 def _feet(tree: Tree, leg: Leg, flat: bool) -> list[Shape]:
-    """Return the shapes of a leg's last link that touch the ground: soles if `flat`, else balls. A ball is added to a rod."""
+    """Return the shapes of the last link that touch the ground: soles if `flat`, else balls. If no shape fits, add a ball."""
     link = tree.links[leg.end]
     shapes = [shape for shape in link.shapes if shape.collides]
     if any(hinge.rolls for hinge in link.hinges):

@@ -39,7 +39,7 @@ class MeshMissing(MeshProblem):
 
 def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     """Return the mesh file that a URDF in `folder` names. `name` is a path, or begins with `file://` or `package://`.
-    Packages are searched in `folder`, in the folders above it, and in `roots`.
+    Packages are looked for in `folder`, in the folders above it, and in `roots`.
 
     Raises:
         MeshMissing: there is no such file.
@@ -47,7 +47,7 @@ def find(name: str, folder: Path, roots: Sequence[Path]) -> Path:
     path = re.sub(r"^(package|file|model):/*", lambda m: "/" if m[1] == "file" else "", unquote(name.strip()))
     parts = [part for part in Path(path).parts if part not in ("/", "\\")]
     places = [folder, *folder.parents, *roots]
-    # A tail is the path without its first parts, such as the name of a package, or folders of another machine.
+    # A tail is the path without its first i parts. These may be a package's name or folders of another machine.
     tails = [parts[i:] for i in range(len(parts))]
     options = [Path(path)] if Path(path).is_absolute() else [folder / path]
     options += [place.joinpath(*tail) for tail in tails[:2] for place in places]

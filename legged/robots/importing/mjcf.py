@@ -198,7 +198,7 @@ def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, 
 
 
 def _turn_upright(base: Link) -> None:
-    """Turn the frame of the base parallel to the world's, about its own origin."""
+    """Turn the frame of the base about its origin, so that its axes are parallel to the world's axes."""
     turn = matrix(base.quat)
     base.com, base.inertia = turn @ base.com, turn @ base.inertia @ turn.T
     for shape in base.shapes:
@@ -290,7 +290,7 @@ def _texture(model: mujoco.MjModel, material: int) -> np.ndarray:
 
 
 def _meshes(spec: mujoco.MjSpec, model: mujoco.MjModel, path: Path) -> dict[int, Mesh]:
-    """Return id -> mesh of a model. A mesh has a file, or vertices if the MJCF states or moves them."""
+    """Return id -> mesh: the mesh's file if it exists and the MJCF does not move or turn the mesh, else its vertices."""
     found: dict[int, Mesh] = {}
     for mesh in spec.meshes:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, mesh_name(mesh))
@@ -327,7 +327,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
             anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                turned = [  # the frame of the base was turned, and so are the anchors in it
+                turned = [  # anchors on the base are turned, because its frame was turned
                     rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
                     for body, name, anchor in zip(bodies, names, anchors, strict=True)
                 ]
@@ -357,7 +357,7 @@ def _read_apart(model: mujoco.MjModel, tree: Tree) -> None:
 
 def _coupling(factors: np.ndarray, first: float, second: float = 0.0) -> np.ndarray:
     """Return the coefficients (5,) of the polynomial that gives the first hinge's angle from the second's [rad]. `first`
-    and `second` are the joints' `ref` angles [rad]. MuJoCo's coefficients `factors` are for angles relative to these.
+    and `second` are the joints' `ref` angles [rad]. MuJoCo's coefficients `factors` are for angles from `ref`.
     """
     polynomial = first + np.polynomial.Polynomial(factors)(np.polynomial.Polynomial([-second, 1.0]))
     return np.pad(polynomial.coef, (0, 5 - len(polynomial.coef)))

@@ -88,7 +88,7 @@ def _touched_colour(group: int) -> str:
 
 def _mesh(mesh: Mesh, file: Path) -> str:
     scale = "" if mesh.file is None or np.allclose(mesh.scale, 1.0) else f' scale="{numbers(mesh.scale)}"'
-    # inertia="shell" makes MuJoCo accept meshes without a volume. It changes no masses, as visual meshes have none.
+    # inertia="shell" makes MuJoCo accept meshes without a volume. It changes no mass, because visual meshes are massless.
     return f'    <mesh name={quoteattr(mesh.name)} file={quoteattr(file.as_posix())}{scale} inertia="shell"/>'
 
 

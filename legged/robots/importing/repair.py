@@ -254,5 +254,5 @@ def half_lengths(shape: Shape) -> Vector | None:
 
 
 def plain(name: str) -> str:
-    """Return a name that MJCF and YAML take without quotes."""
+    """Return a name in which characters other than ASCII letters, digits, `_`, `.` and `-` are replaced by `_`."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_") or "unnamed"

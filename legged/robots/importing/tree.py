@@ -208,7 +208,7 @@ def vector_of(text: str) -> Vector:
 
 
 def listed(names: list[str]) -> str:
-    """Return names as a list, cut after MOST_NAMED of them."""
+    """Return at most MOST_NAMED names, separated by commas, and the number of names left out."""
     return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
 
 

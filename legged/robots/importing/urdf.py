@@ -27,8 +27,8 @@ KINDS = (*HINGES, *NO_HINGES, "fixed")
 
 
 def read_urdf(path: Path, roots: Sequence[Path] = (), drawn: bool = True) -> Tree:
-    """Return the robot of a URDF file, with its visual shapes if `drawn`. Packages are also searched in `roots`. A link on a
-    fixed joint becomes a link without hinges.
+    """Return the robot of a URDF file, with its visual shapes if `drawn`. Packages may also be in the folders `roots`. A link
+    on a fixed joint becomes a link without hinges.
 
     Raises:
         ConfigError: the file is not a URDF, or does not describe exactly one robot.
@@ -123,7 +123,7 @@ def _top(elements: dict[str, ET.Element], joints: list["_Joint"], path: Path) ->
 
 
 def _pass_over(tree: Tree, above: Sequence["_Joint"]) -> None:
-    """Turn the robot as the joints above its base turn it, and report that the links above the base are left out."""
+    """Apply to the robot the rotations of the joints above its base, and report that links above the base are left out."""
     for joint in reversed(above):
         tree.turn(_origin(joint.element, joint.path)[1])
         if joint.kind == "fixed" and joint.parent != "world":

@@ -51,7 +51,7 @@ def _across(point: Vector, hinge: Hinge) -> Vector:
 
 
 def _about(shape: Shape, hinge: Hinge) -> Shape | None:
-    """Return the round shape about a hinge's axis that stands for `shape`; None if `shape` is not round about this axis."""
+    """Return `shape` as a round shape about the hinge's axis; None if `shape` is not round about this axis."""
     if shape.points is not None:
         return _cylinder(shape, shape.points, hinge)
     if shape.kind not in ("sphere", "cylinder", "capsule"):
