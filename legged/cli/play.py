@@ -76,9 +76,7 @@ def play(args: argparse.Namespace) -> int:
     else:
         for flag in ("terrain", "difficulty"):
             if getattr(args, flag) is not None:
-                raise ConfigError(
-                    f"--{flag}: '{policy.cfg.task}' has no terrain to choose, because the robot's model contains the ground"
-                )
+                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose; its model contains the ground")
         playground = None
         policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
         ready_to_write(folder, ROOM_MB)

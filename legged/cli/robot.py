@@ -41,11 +41,7 @@ ROOM_MB = 100.0
     arguments=(
         argument("source", metavar="SOURCE", help="a URDF or MJCF file, or menagerie:NAME for a model of MuJoCo Menagerie"),
         argument("--name", help="name of the robot; by default the name of the file"),
-        argument(
-            "--out",
-            type=Path,
-            help="where to write the robot's folder and task; by default resources/robots and cfg (outside a clone, here)",
-        ),
+        argument("--out", type=Path, help="folder for robot and task; by default resources/robots and cfg of a clone"),
         argument("--extends", metavar="TASK", help="task that the new task extends; by default one of those in cfg/base"),
         argument("--hold", metavar="PATTERN", action="append", default=[], help="joints to hold still; may be repeated"),
         argument("--packages", type=Path, action="append", default=[], help="folder in which to look for package:// files"),

@@ -39,9 +39,7 @@ PROGRAM = (
     argument("--seconds", type=float, default=float("inf"), help="end after this time [s]; default: when the operator quits"),
     argument("--stand-seconds", type=float, default=3.0, help="time for standing up [s]; default 3"),
     argument("--max-tilt", type=float, default=Limits.max_tilt, help=f"stop at more tilt [rad]; default {Limits.max_tilt:g}"),
-    argument(
-        "--max-age", type=float, default=Limits.max_age_s, help=f"largest age of data [s]; default {Limits.max_age_s:g}"
-    ),
+    argument("--max-age", type=float, default=Limits.max_age_s, help=f"largest data age [s]; default {Limits.max_age_s:g}"),
     argument(
         "--max-missed",
         type=int,

@@ -107,7 +107,7 @@ def unpack_facts(body: bytes) -> RobotFacts:
 
 
 def pack_state(state: Reading) -> bytes:
-    """Return the body of a state. `state.torques` must not be None."""
+    """Return the body of a STATE packet. `state.torques` must not be None."""
     assert state.torques is not None
     rows = (state.quaternion, state.gyro, state.positions, state.velocities, state.torques)
     parts = [STATE_HEAD.pack(state.time, len(state.positions), 0, len(state.sources))]

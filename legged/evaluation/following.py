@@ -1,6 +1,4 @@
-"""Evaluations of legged robots that follow commands. They measure tracking of commands and success on terrain, compare
-tracking in all engines, and compare the tracking of all checkpoints of a run.
-"""
+"""Evaluations of robots that follow commands: tracking, success on terrain, tracking in all engines, all checkpoints."""
 
 import time
 from collections.abc import Mapping, Sequence

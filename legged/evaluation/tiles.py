@@ -48,9 +48,7 @@ def dividing_cell(length: float, cell: float) -> float:
 
 
 def cell_for(name: str, cfg: TerrainConfig) -> float:
-    """Return the edge of the height-map cells for a terrain type [m]. It is that of the training, or a smaller one if
-    features of the type must be whole cells.
-    """
+    """Return the edge of height-map cells for a terrain type [m]: the training's, or less to fit the type's features."""
     kind = TERRAIN_TYPES[name]
     if not kind.exact or kind.finest is None:
         return cfg.horizontal_scale

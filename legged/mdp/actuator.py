@@ -233,7 +233,7 @@ class Actuator:
         """
         if self._drawn is not None:
             drawn = self._drawn.values[:, 0].clamp(max=float(self.longest)).int()
-            if self._varies:  # a longer new delay must not take back a target that has arrived
+            if self._varies:  # limited, so that no older target replaces one that has arrived
                 latest = (torch.div(self.delay, self.decimation, rounding_mode="floor") + 1) * self.decimation
                 torch.where(mask, drawn, torch.minimum(drawn, latest), out=self.delay)
             else:

@@ -179,9 +179,7 @@ def define(name: str, data: dict[str, Any], parent: Any) -> type:
 
 
 def load(file: Path) -> tuple[types.ModuleType, Path]:
-    """Import the file as a module of its package. Return the module and the package's folder. If the file is outside any
-    package, return the file's folder instead.
-    """
+    """Import the file as a module of its package. Return the module and the folder of the package, else of the file."""
     gap, root, own = 0, file.parent, ALONE
     for folder in file.parents:
         gap += 1

@@ -124,7 +124,7 @@ def _contacts(
         except ConfigError:
             result.lose(theirs, f"'{pattern}' is part of no body or shape of {robot} that collides")
             continue
-        # A pattern that is only in a body's name does not select feet, because a foot's shape may be on the shank's body.
+        # Outside the list of feet, a pattern in no shape's name does not select feet: 'shank' must not select a foot on it.
         named = theirs == LISTS[0][0] or any(pattern in name for name in shapes.names)
         chosen = [i for i in indices if named or shapes.contact[i] not in shapes.feet]
         kept += [pattern] if len(chosen) == len(indices) else [shapes.names[i] for i in chosen]

@@ -1,6 +1,4 @@
-"""Set-up at the start of a process. This module is imported before any large package, because its settings must act during
-the imports, which take most of the start-up time.
-"""
+"""Set-up at the start of a process. It is imported before any large package, because its settings shorten the imports."""
 
 import atexit
 import gc
