@@ -248,7 +248,7 @@ def grid_means(result: dict[str, Any], name: str, over: int) -> np.ndarray:
 
 
 def draw_tracking(result: dict[str, Any], path: Path) -> None:
-    """Draw heat maps of velocity errors over (vx, vy) and of yaw rate errors over (vx, yaw), averaged over the third command."""
+    """Draw heat maps of velocity errors over (vx, vy) and yaw rate errors over (vx, yaw). The other command is averaged."""
     grid = result["grid"]
     with figure(path, (10.0, 4.2), columns=2) as (drawn, axes):
         for axis, (name, over, other, label) in zip(axes[0], PANELS, strict=True):
