@@ -28,7 +28,7 @@ def test_checkpoints_are_judged_in_order_and_the_first_good_one_is_named(capsys)
     for number, seconds in ((0, 4.0), (1, 5.0), (2, 6.5)):
         path = folder / f"model_{number}.pt"
         saved = read_checkpoint(path)
-        assert 0.0 < saved["infos"]["wall_s"] < 3600.0
+        assert saved["infos"]["wall_s"] > 0.0
         saved["infos"]["wall_s"] = seconds
         for name, tensor in saved["actor_state_dict"].items():
             if number and "mlp" in name:
