@@ -193,8 +193,8 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
                 return max(runs, key=_last_saved)
     known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
     if exists(Path(name)) and Path(name).is_dir():
-        remedy = f"; {FROM_LEGGED_GYM}" if checkpoints(Path(name)) else ""
-        raise ConfigError(f"{where}: {shown(name)} holds no run: there is no {CONFIG_FILE} in it or in its folders{remedy}")
+        said = f"there is no {CONFIG_FILE} in it or in its folders{_remedy(Path(name))}"
+        raise ConfigError(f"{where}: {shown(name)} holds no run: {said}")
     if exists(Path(name)) and name.endswith(".pt"):
         raise ConfigError(f"{where}: {shown(name)} is a file; name the folder of the run; {FROM_LEGGED_GYM}")
     raise ConfigError(f"{where}: there is no task and no run {shown(name)}{suggest(name[:100], [*task_names(), *known])}")
@@ -277,8 +277,7 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
-        remedy = f"; {FROM_LEGGED_GYM}" if checkpoints(folder) else ""
-        raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE}){remedy}")
+        raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE}){_remedy(folder)}")
     data = read_yaml(path)
     actuator_path(data, folder)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
@@ -293,6 +292,11 @@ def _last_saved(folder: Path) -> float:
         with suppress(OSError):  # the file may have been removed
             stamps.append(path.stat().st_mtime)
     return max(stamps, default=0.0)
+
+
+def _remedy(folder: Path) -> str:
+    """Return the end of an error about a folder without a configuration. With checkpoints it may be a run of legged_gym."""
+    return f"; {FROM_LEGGED_GYM}" if checkpoints(folder) else ""
 
 
 def checkpoints(folder: Path) -> dict[int, Path]:

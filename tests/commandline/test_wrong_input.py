@@ -272,6 +272,7 @@ FOREIGN = {
     "cut": lambda path: path.write_bytes(path.read_bytes()[:1000]),
     "dictionary": lambda path: torch.save({"a": 1}, path),
     "number": lambda path: torch.save(3, path),
+    "legged_gym": lambda path: torch.save({"model_state_dict": {}, "optimizer_state_dict": {}, "iter": 1500}, path),
 }
 
 
@@ -280,7 +281,8 @@ FOREIGN = {
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_a_file_that_is_no_checkpoint(fails, run, main, flag, kind):
     FOREIGN[kind](run / "model_0.pt")
-    fails(main, task(flag), "model_0.pt: not a checkpoint")
+    what = "a checkpoint of rsl-rl before 5.0; docs/migrating.md" if kind == "legged_gym" else "not a checkpoint"
+    fails(main, task(flag), f"model_0.pt: {what}")
 
 
 def test_a_checkpoint_without_optimiser_cannot_be_trained_on(fails, run):

@@ -164,7 +164,7 @@ def test_the_best_policy_can_be_played_and_trained_on(capsys):
     plain = tiny_run(iterations=1)
     flags[0] = str(plain)
     assert call(evaluate_grid.main, [*flags, "best"]) == 2
-    assert f"{plain.name} has no model_best.pt; a training writes it if" in capsys.readouterr().err
+    assert f"{plain.name} has no model_best.pt; a training writes it if train.runner" in capsys.readouterr().err
     assert call(evaluate_grid.main, [*flags, "bset"]) == 2
     assert "'bset' (allowed: an iteration, or best)" in capsys.readouterr().err
     assert best["iter"] in range(3)

@@ -106,7 +106,10 @@ def test_each_step_of_a_mini_batch_is_weighed_by_its_own_advantage_and_no_other_
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ("train.algorithm.symmetry=true", r"train\.algorithm\.symmetry: .*lstm.*train\.algorithm\.symmetry=false"),
+        (
+            "train.algorithm.symmetry=true",
+            r"train\.algorithm\.symmetry: .*lstm.* mirror images; set train\.algorithm\.symmetry=false",
+        ),
         ("train.algorithm.num_mini_batches=9", r"num_mini_batches: .*at most env\.num_envs=8.* got 9"),
         ("train.policy.rnn_type=lsmt", r"train\.policy\.rnn_type: .*lstm"),
         ("train.policy.rnn_hidden_dim=0", r"train\.policy\.rnn_hidden_dim: "),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import onnx
@@ -179,10 +180,14 @@ def test_motors_that_are_not_simulated_are_told(changes, warns, tmp_path, capsys
 @pytest.mark.parametrize(
     ("changes", "bias", "says"),
     [
-        ({"stiffness": [900.0] * 12}, 0.0, "policy.json: stiffness: "),
+        ({"stiffness": [900.0] * 12}, 0.0, r"policy\.json: stiffness: .*policy\.onnx has another value"),
         ({"damping": [0.0] * 12}, 0.0, "damping: must be above 0"),
         ({"control_dt": 0.0005}, 0.0, "control_dt: must be between 0.001 and 1, got 0.0005"),
-        ({"joint_names": list(reversed(load_robot("anymal_c").joint_names))}, 0.0, "policy.json: joint_names: "),
+        (
+            {"joint_names": list(reversed(load_robot("anymal_c").joint_names))},
+            0.0,
+            r"policy\.json: joint_names: .*policy\.onnx has another value",
+        ),
         ({}, math.nan, "policy.onnx: gives actions that are not finite"),
     ],
     ids=["gains", "damping", "control_dt", "joints", "NaN"],
@@ -194,7 +199,7 @@ def test_an_export_is_played_with_its_own_contract_alone(changes, bias, says, tm
     metadata = {key: json.dumps(value) for key, value in description.items()}
     policy = write_policy(tmp_path / "policy.onnx", np.zeros((48, 12)), np.full(12, bias), **metadata)
     assert call(evaluate_onnx.main, [str(policy), "--command", "0,0,0", "--seconds", "2.1"]) == 2
-    assert says in capsys.readouterr().err
+    assert re.search(says, capsys.readouterr().err)
 
 
 def test_the_first_that_follows(standing, tmp_path, capsys):
