@@ -139,7 +139,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) middle of the area in which each robot's episodes begin, world frame [m]."""
         if self.terrain is not None:
-            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, device, kernels)
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, self.dt, device, kernels)
             self.env_origins = self.terrain_curriculum.origins
         reach, height = cfg.terrain.spawn_range if self.terrain is not None else 0.0, robot.file.spawn_height
         self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
@@ -251,8 +251,9 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.command_curriculum.update(self.commands[:, :3], self.base_lin_vel, self.base_ang_vel, self.valid)
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
         if self.terrain_curriculum is not None:
-            asked = self.commands[:, :2].norm(dim=1) * self.cfg.env.episode_length_s
-            self.terrain_curriculum.update(self.reset_buf & self.valid, self.base_pos, asked)
+            steps_left = self.max_episode_length - self.episode_length_buf
+            step = (self.commands, self.base_lin_vel, steps_left)
+            self.terrain_curriculum.update(self.reset_buf, self.valid, *step)
 
     def reset_idx(self, mask: Tensor) -> None:
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
@@ -265,6 +266,8 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     def reset(self) -> TensorDict:
         self.disturbances.end(self.physics)
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.begin()
         return super().reset()
 
     def redraw(self, mask: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Terrain curriculum: robots that walk far move to harder tiles, robots that fall short move to easier ones."""
+"""Terrain curriculum: robots that follow their commands move to harder tiles, robots that fall short move to easier ones."""
 
 from typing import TYPE_CHECKING
 
@@ -12,26 +12,38 @@ if TYPE_CHECKING:
     from legged.physics.warp.task_kernels import TaskKernels
 
 
+PROMOTED, DEMOTED = 0.8, 0.5
+"""Share of the asked way above which a robot moves up a level, and share below which it moves down."""
+
+
 class TerrainCurriculum:
     """Tile of each robot. The column of the tile (a terrain type) is fixed; the row (a level) changes with success.
 
-    The rule is legged_gym's. A robot moves up a level if it ends further than half a tile from the middle of its tile. It
-    moves down if it got less than half as far as its command asked. A robot that moves up from the top level goes to a random
-    level. Therefore, with ten rows, a policy that is always promoted has a mean level of 6.0, not 9.
+    The *asked* way is the length of the path that the commands of an episode describe. After a fall, the last command counts
+    for the time that was left. *Progress* is the way that the robot walked in the commanded directions, along curves too. A
+    robot moves up if its progress exceeds PROMOTED of the asked way, or half a tile where that is less. It moves down if its
+    progress is below DEMOTED of the asked way. A robot that was asked to turn on the spot or to stand keeps its level.
+
+    A robot that moves up from the top level goes to a random level. Therefore, with ten rows, a policy that is always
+    promoted has a mean level of 6.0, not 9. legged_gym judges the distance from the middle of the tile instead, so that
+    robots that walk along curves move down.
     """
 
-    STATE = ("levels", "columns", "origins", "_sums")
+    STATE = ("levels", "columns", "origins", "way", "_sums")
 
     def __init__(
         self,
         cfg: TerrainConfig,
         terrain: Terrain,
         num_envs: int,
+        dt: float,
         device: torch.device,
         kernels: "TaskKernels | None" = None,
     ) -> None:
-        """Spread robots evenly over the columns, at random levels up to cfg.max_init_terrain_level."""
-        self.enabled, self._kernels = cfg.curriculum, kernels
+        """Spread robots evenly over the columns, at random levels up to cfg.max_init_terrain_level. `dt` is the control step
+        [s].
+        """
+        self.enabled, self.dt, self._kernels = cfg.curriculum, dt, kernels
         self.rows, columns = terrain.origins.shape[:2]
         highest = cfg.max_init_terrain_level if cfg.curriculum else self.rows - 1
         self.levels = torch.randint(0, min(highest, self.rows - 1) + 1, (num_envs,), device=device)
@@ -41,6 +53,8 @@ class TerrainCurriculum:
         """(N,) column of each robot's tile."""
         self.origins = torch.zeros(num_envs, 3, device=device)
         """(N, 3) middle of each robot's tile, world frame [m]."""
+        self.way = torch.zeros(2, num_envs, device=device)
+        """(2, N) progress and asked way since each robot's episode began [m]."""
         self.names = terrain.type_names
         kinds = torch.tensor([self.names.index(name) for name in terrain.types], device=device)
         self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N) for K types
@@ -50,6 +64,10 @@ class TerrainCurriculum:
         self._random = torch.zeros_like(self.levels)
         self._sums = torch.zeros(3, len(self.names), device=device)  # rows: episodes, promoted, demoted
         self._place()
+
+    def begin(self) -> None:
+        """Begin new episodes on the present tiles."""
+        self.way.zero_()
 
     def reset(self) -> None:
         """Reset to the levels that training starts with."""
@@ -61,21 +79,36 @@ class TerrainCurriculum:
         """Draw a random level for every robot. A robot that finishes the hardest level moves to its random level."""
         self._random.random_(0, self.rows)
 
-    def update(self, mask: Tensor, base_pos: Tensor, asked: Tensor) -> None:
-        """Move the robots of `mask` (N,), whose episodes end, to their next levels. `base_pos` (N, 3) is their final position
-        [m]; `asked` (N,) is the distance that their command asks for in an episode [m].
+    def update(self, ended: Tensor, valid: Tensor, commands: Tensor, base_lin_vel: Tensor, steps_left: Tensor) -> None:
+        """Add a control step to the robots' progress, and move the robots whose episodes end to their next levels.
+
+        Args:
+            ended: (N,) bool, the robots whose episodes end.
+            valid: (N,) bool, the robots whose state is finite. Other robots make no progress and keep their levels.
+            commands: (N, 2 or more) vx and vy in the base frame [m/s].
+            base_lin_vel: (N, 3) velocities of the bases in the base frame [m/s].
+            steps_left: (N,) int64, control steps until an episode's time is up.
         """
         if not self.enabled:
             return
         if self._kernels is not None:
-            judged = torch.empty(3, len(mask), device=mask.device)
+            judged = torch.empty(3, len(ended), device=ended.device)
+            step = (ended, valid, commands, base_lin_vel, steps_left, self.dt)
             tiles = (self.rows, self._count, self._random, self.columns, self._tiles)
-            self._kernels.move_levels(mask, base_pos, asked, self._far, *tiles, self.levels, self.origins, judged)
+            self._kernels.move_levels(
+                *step, self._far, PROMOTED, DEMOTED, *tiles, self.way, self.levels, self.origins, judged
+            )
             self._sums.add_(judged @ self._of_type.t())
             return
-        walked = (base_pos[:, :2] - self.origins[:, :2]).norm(dim=1)
-        up = mask & (walked > self._far)
-        down = mask & (walked < 0.5 * asked) & ~up
+        speed = commands[:, :2].norm(dim=1)
+        along = (commands[:, :2] * base_lin_vel[:, :2]).sum(dim=1) / speed.clamp(min=1e-6)
+        self.way.add_(torch.where(valid, self.dt * torch.stack([along, speed]), 0.0))
+        progress, asked = self.way[0], self.way[1] + self.dt * steps_left * speed
+        mask = ended & valid
+        up = mask & (progress > (PROMOTED * asked).clamp(max=self._far))
+        down = mask & (progress < DEMOTED * asked) & ~up
+        up &= asked > 0.0
+        self.way.masked_fill_(ended, 0.0)
         self._sums.add_(torch.stack([mask.float(), up.float(), down.float()]) @ self._of_type.t())
         moved = (self.levels + up.long() - down.long()).clamp(min=0)
         self.levels.copy_(torch.where(moved >= self.rows, self._random, moved))

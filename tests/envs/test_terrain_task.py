@@ -196,48 +196,88 @@ def test_initial_headings_are_drawn():
 
 
 def curriculum(rows=10, robots=6, **changes) -> TerrainCurriculum:
+    """Return a curriculum with a control step of 1 s."""
     cfg = TerrainConfig(mesh_type="height_map", num_rows=rows, border_size=2.0, max_init_terrain_level=0, **changes)
     tiles = [[TileSpec("flat", 0.0), TileSpec("pit", 0.0)] for _ in range(rows)]
-    return TerrainCurriculum(cfg, Terrain.of_tiles(tiles, cfg, np.random.default_rng(0)), robots, CPU)
+    return TerrainCurriculum(cfg, Terrain.of_tiles(tiles, cfg, np.random.default_rng(0)), robots, 1.0, CPU)
+
+
+def walk(levels: TerrainCurriculum, asked, walked, ended=True, valid=True, steps_left=0) -> list[int]:
+    """Ask for `asked` m forward and walk `walked` m in a step of 1 s; return the levels."""
+    n = len(levels.levels)
+    commands, velocity = torch.zeros(n, 4), torch.zeros(n, 3)
+    commands[:, 0], velocity[:, 0] = torch.as_tensor(asked), torch.as_tensor(walked)
+    masks = [torch.as_tensor(mask).expand(n) for mask in (ended, valid)]
+    levels.update(*masks, commands, velocity, torch.as_tensor(steps_left).expand(n))
+    return levels.levels.tolist()
 
 
 def test_levels_follow_success():
-    """Further than 4 m: up. Less than half of what was asked: down. Neither, or still under way: as before."""
-    levels = curriculum()
+    """Further than 4 m or than 0.8 of what was asked: up. Less than half of it: down. Else, or still under way: as before."""
+    levels = curriculum(robots=8)
     levels.levels.fill_(5)
     levels._place()
-    walked = torch.tensor([4.1, 3.9, 0.4, 0.6, 4.1, 0.0])
-    place = levels.origins.clone()
-    place[:, 0] += walked
-    asked = torch.tensor([20.0, 7.0, 1.0, 1.0, 20.0, 0.0])
-    ended = torch.tensor([True, True, True, True, False, True])
-    levels.update(ended, place, asked)
-    assert levels.levels.tolist() == [6, 5, 4, 5, 5, 5]
+    ended = [True, True, True, True, False, True, True, True]
+    asked = [20.0, 7.0, 1.0, 1.0, 20.0, 0.0, 3.8, 3.8]
+    walked = [4.1, 3.9, 0.4, 0.6, 4.1, 0.0, 3.1, 3.0]
+    assert walk(levels, asked, walked, ended) == [6, 5, 4, 5, 5, 5, 6, 5]
     x = levels._tiles.view(10, 2, 3)[levels.levels, levels.columns]
     torch.testing.assert_close(levels.origins, x)
     log = levels.metrics()
-    assert log["Terrain/level_flat"] == pytest.approx(5.0)  # (6 + 5 + 4) / 3
-    assert log["Terrain/promoted_flat"] == pytest.approx(1 / 3)
-    assert log["Terrain/demoted_flat"] == pytest.approx(1 / 3)
-    assert log["Terrain/promoted_pit"] == 0.0
+    assert log["Terrain/level_flat"] == pytest.approx(5.0)  # (6 + 5 + 4 + 5) / 4
+    assert log["Terrain/promoted_flat"] == pytest.approx(1 / 4)
+    assert log["Terrain/demoted_flat"] == pytest.approx(1 / 4)
+    assert log["Terrain/promoted_pit"] == pytest.approx(1 / 3)
+
+
+def test_robots_that_walk_along_a_curve_or_change_direction_move_up():
+    """The end of both ways is near the middle of the tile, and the robots walked what they were asked to walk."""
+    levels = curriculum(robots=2)
+    commands = torch.tensor([[0.5, 0.0, 0.5, 0.0], [0.3, 0.4, 0.0, 0.0]])
+    still, everyone = torch.tensor([[False] * 2, [True] * 2])
+    for step in range(20):
+        if step == 10:
+            commands[1] *= -1.0
+        velocity = 0.9 * commands[:, :3]  # in the base frame
+        levels.update(everyone if step == 19 else still, everyone, commands, velocity, torch.full((2,), 19 - step))
+    assert levels.levels.tolist() == [1, 1]
+    assert levels.way.tolist() == [[0.0, 0.0], [0.0, 0.0]]
+
+
+def test_progress_is_along_the_command():
+    levels = curriculum(robots=2)
+    levels.levels.fill_(5)
+    commands, velocity = torch.tensor([[1.0, 0.0], [0.0, -8.0]]), torch.tensor([[0.0, 8.0, 0.0], [6.0, -6.0, 0.0]])
+    everyone = torch.ones(2, dtype=torch.bool)
+    levels.update(everyone, everyone, commands, velocity, torch.zeros(2, dtype=torch.long))
+    assert levels.levels.tolist() == [4, 6]
+
+
+def test_after_a_fall_the_last_command_counts_for_the_time_that_was_left():
+    levels = curriculum(robots=2)
+    levels.levels.fill_(5)
+    assert walk(levels, 1.0, 1.0, steps_left=[2, 0]) == [4, 6]  # 1 m of 3 m, and of 1 m
+
+
+def test_a_state_that_is_not_finite_moves_no_robot():
+    levels = curriculum(robots=2)
+    levels.levels.fill_(5)
+    assert walk(levels, 1.0, [math.nan, 1.0], valid=[False, True]) == [5, 6]
+    assert walk(levels, 1.0, 1.0) == [6, 7]
 
 
 def test_nobody_falls_below_the_easiest_level():
-    levels = curriculum()
-    levels.update(torch.ones(6, dtype=torch.bool), levels.origins, torch.full((6,), 20.0))
-    assert levels.levels.tolist() == [0] * 6
+    assert walk(curriculum(), 20.0, 0.0) == [0] * 6
 
 
 def test_always_promoted_robots_have_a_mean_level_of_six():
     """Over ten rows and a random level after the top: sum of l (l + 1) over sum of (l + 1) = 330 / 55."""
     torch.manual_seed(0)
     levels = curriculum(robots=4000)
-    far = torch.tensor([5.0, 0.0, 0.0])
-    everyone = torch.ones(4000, dtype=torch.bool)
     means = []
     for i in range(200):
         levels.draw()
-        levels.update(everyone, levels.origins + far, torch.full((4000,), 20.0))
+        walk(levels, 20.0, 5.0)
         if i >= 100:
             means.append(levels.levels.float().mean())
     assert torch.stack(means).mean() == pytest.approx(6.0, abs=0.05)
@@ -276,8 +316,8 @@ def test_the_step_judges_levels_and_logs_them(task):
     task.reset_curricula()
     task.reset()
     task.terrain_curriculum.levels.fill_(1)
-    task.commands[:, 0] = 0.5
-    task.episode_length_buf = torch.full((8,), task.max_episode_length)
+    task.terrain_curriculum.way[1] = 10.0
+    task.episode_length_buf = torch.full((8,), task.max_episode_length - 1)
     task.step(zero_actions(task))
     assert task.terrain_curriculum.levels.tolist() == [0] * 8  # asked for 10 m, walked none
     assert task.log_rollout()["Terrain/demoted_stairs_up"] == 1.0

@@ -119,7 +119,8 @@ def test_robots_that_begin_anew_stand_on_their_tiles_and_nobody_is_promoted():
     assert task.terrain_curriculum.levels.tolist() == levels.tolist()
     away = (task.base_pos[:, :2] - task.env_origins[:, :2]).norm(dim=1)
     assert away.max() <= task.cfg.terrain.spawn_range * 2**0.5 + 1e-5
-    task.terrain_curriculum.update(torch.ones(40, dtype=torch.bool), task.base_pos, torch.zeros(40))
+    everyone, nothing = torch.ones(40, dtype=torch.bool), torch.zeros(40, dtype=torch.long)
+    task.terrain_curriculum.update(everyone, everyone, torch.zeros(40, 4), torch.zeros(40, 3), nothing)
     assert task.terrain_curriculum.levels.tolist() == levels.tolist()
 
 

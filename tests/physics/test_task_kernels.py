@@ -141,14 +141,18 @@ def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere(scan):
 
 def test_robots_move_between_levels_alike():
     terrain = ground()
-    parts = pair(lambda kernels: TerrainCurriculum(TerrainConfig(max_init_terrain_level=3), terrain, N, CPU, kernels))
-    for step in range(8):
-        mask, away, asked = chance(0.7, N), 6.0 * torch.rand(N, 3), 8.0 * torch.rand(N)
+    parts = pair(lambda kernels: TerrainCurriculum(TerrainConfig(max_init_terrain_level=3), terrain, N, 1.0, CPU, kernels))
+    for step in range(16):
+        ended, valid, left = chance(0.4, N), chance(0.9, N), torch.randint(0, 2, (N,))
+        commands, velocity = 4.0 * torch.randn(N, 4), 4.0 * torch.randn(N, 3)
+        commands[::5], velocity[~valid] = 0.0, torch.nan
         for part in parts:
             torch.manual_seed(step)
             part.draw()
-            part.update(mask, part.origins + away, asked)
-        assert_same(parts)
+            part.update(ended, valid, commands, velocity, left)
+        assert torch.equal(parts[0].levels, parts[1].levels)
+        torch.testing.assert_close(parts[0].origins, parts[1].origins, rtol=0.0, atol=0.0)
+        torch.testing.assert_close(parts[0].way, parts[1].way)
     assert parts[0]._sums[1:].sum(dim=1).min() > 10.0
 
 

@@ -231,25 +231,38 @@ def scan_heights(
 
 @wp.kernel
 def move_levels(
-    mask: wp.array[wp.bool],
-    base_pos: wp.array2d[float],
-    asked: wp.array[float],
+    ended: wp.array[wp.bool],
+    valid: wp.array[wp.bool],
+    commands: wp.array2d[float],
+    base_lin_vel: wp.array2d[float],
+    steps_left: wp.array[wp.int64],
+    dt: float,
     far: float,
+    promoted: float,
+    demoted: float,
     rows: int,
     columns: int,
     random: wp.array[wp.int64],
     column: wp.array[wp.int64],
     tiles: wp.array2d[float],
+    way: wp.array2d[float],
     levels: wp.array[wp.int64],
     origins: wp.array2d[float],
     judged: wp.array2d[float],
 ):
-    """Move robots between terrain levels. One thread per robot."""
+    """Add a control step to the robots' progress, and move robots between terrain levels. One thread per robot."""
     robot = wp.tid()
-    over_x, over_y = base_pos[robot, 0] - origins[robot, 0], base_pos[robot, 1] - origins[robot, 1]
-    walked = wp.sqrt(over_x * over_x + over_y * over_y)
-    up = mask[robot] and walked > far
-    down = mask[robot] and walked < 0.5 * asked[robot] and not up
+    x, y = commands[robot, 0], commands[robot, 1]
+    speed = wp.sqrt(x * x + y * y)
+    along = (x * base_lin_vel[robot, 0] + y * base_lin_vel[robot, 1]) / wp.max(speed, 1.0e-6)
+    progress = way[0, robot] + wp.where(valid[robot], dt * along, 0.0)
+    so_far = way[1, robot] + wp.where(valid[robot], dt * speed, 0.0)
+    asked = so_far + dt * float(steps_left[robot]) * speed
+    way[0, robot] = wp.where(ended[robot], 0.0, progress)
+    way[1, robot] = wp.where(ended[robot], 0.0, so_far)
+    mask = ended[robot] and valid[robot]
+    up = mask and asked > 0.0 and progress > wp.min(promoted * asked, far)
+    down = mask and progress < demoted * asked and not up
     level = int(levels[robot]) + wp.where(up, 1, 0) - wp.where(down, 1, 0)
     level = wp.max(level, 0)
     if level >= rows:
@@ -258,7 +271,7 @@ def move_levels(
     tile = level * columns + int(column[robot])
     for i in range(3):
         origins[robot, i] = tiles[tile, i]
-    judged[0, robot] = wp.where(mask[robot], 1.0, 0.0)
+    judged[0, robot] = wp.where(mask, 1.0, 0.0)
     judged[1, robot] = wp.where(up, 1.0, 0.0)
     judged[2, robot] = wp.where(down, 1.0, 0.0)
 
