@@ -5,6 +5,8 @@ import shlex
 import sys
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 from helpers import call, forget_modules_of
 
@@ -13,6 +15,8 @@ from legged.cli.evaluate import episodes
 from legged.cli.play import play
 from legged.cli.train import train
 from legged.physics import FIELDS
+from legged.terrain import TERRAIN_TYPES
+from legged.terrain.generators import Tile
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
@@ -31,6 +35,7 @@ def named(page: str) -> list[tuple[str, str]]:
 
 
 RANDOMISATION = (ROOT / "docs" / "randomisation.md").read_text(encoding="utf-8")
+TERRAIN = (ROOT / "docs" / "terrain.md").read_text(encoding="utf-8")
 BLOCKS = [*named(PAGE), *named(RANDOMISATION)]
 MODULES = {name: text for name, text in BLOCKS if "/" not in name}
 EXCERPTS = [(name, text) for name, text in BLOCKS if "/" in name]
@@ -104,6 +109,23 @@ def test_every_file_of_the_page_is_used_by_a_command_of_it():
     used = " ".join(COMMANDS) + " ".join(MODULES.values())
     assert MODULES
     assert not [name for name in MODULES if name not in used]
+
+
+@pytest.mark.slow
+def test_the_ground_from_a_picture_is_trained_on(files, capsys):
+    (module,) = named(TERRAIN)
+    (files / module[0]).write_text(module[1], encoding="utf-8")
+    grey = np.random.default_rng(0).integers(0, 256, (50, 60), dtype=np.uint8)
+    iio.imwrite(files / "dunes.png", grey)
+    (command,) = [line for _, text in fenced(TERRAIN) for line in text.splitlines() if "--import dunes.py" in line]
+    try:
+        assert run(command) == 0, capsys.readouterr().err
+        tile = Tile(np.zeros((25, 30)), 0.1, np.random.default_rng(0))
+        TERRAIN_TYPES["dunes"].generate(tile, 0.4)
+        corners = 0.4 / 255.0 * grey[[0, 0, -1, -1], [0, -1, 0, -1]]
+        np.testing.assert_allclose(tile.heights[[0, 0, -1, -1], [0, -1, 0, -1]], corners)
+    finally:
+        TERRAIN_TYPES.pop("dunes", None)
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Terrain: generators of tiles, a height map of all tiles, and look-ups in it."""
 
-from legged.terrain.generators import BUMPS, METRES, TERRAIN_TYPES, terrain_type, terrain_types
+from legged.terrain.generators import BUMPS, METRES, TERRAIN_TYPES, TerrainType, terrain_type, terrain_types
 from legged.terrain.height_map import HeightMap
 from legged.terrain.terrain import Terrain, TileSpec, check_terrain, hardest_difficulty, tile_size
 
@@ -10,6 +10,7 @@ __all__ = [
     "TERRAIN_TYPES",
     "HeightMap",
     "Terrain",
+    "TerrainType",
     "TileSpec",
     "check_terrain",
     "hardest_difficulty",
