@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from legged.config.checks import DEEPEST, SHOWN, build, plain_path, shown
+from legged.config.checks import DEEPEST, SHOWN, build, hints_of, plain_path, shown
 from legged.config.legged import LeggedConfig
 from legged.config.origins import Origins
 from legged.config.renamed import renamed
@@ -18,7 +18,7 @@ from legged.process.paths import data_folder, exists
 
 LONGEST_CHAIN = 20
 """Largest number of files in a chain of `extends`."""
-OF_FILES = ("extends", "class", "written_for", "cpu")
+OF_FILES = ("extends", "own_rewards", "class", "written_for", "cpu")
 """Keys of a file that are not fields of the schema."""
 
 
@@ -63,7 +63,7 @@ class _Layer:
     """One configuration in a chain of `extends`."""
 
     data: Mapping[str, Any]
-    """Settings, without `extends`, `class` and `written_for`."""
+    """Settings, without `extends`, `own_rewards`, `class` and `written_for`."""
     name: str
     """Name of the configuration in error messages."""
     folder: Path
@@ -74,6 +74,8 @@ class _Layer:
     """Value of the key `class`; None without this key."""
     reference_robot: Any
     """Robot for which the numbers were written; None if they suit any robot."""
+    own_rewards: bool
+    """True if the reward scales of the extended configurations, and the schema's defaults, do not count."""
 
 
 def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
@@ -97,9 +99,13 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         if isinstance(data.get("cpu"), Mapping):
             data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
         parent, kind, reference_robot = (data.pop(key, None) for key in ("extends", "class", "written_for"))
+        own_rewards = data.pop("own_rewards", False)
+        if not isinstance(own_rewards, bool):
+            raise ConfigError(f"{name}: own_rewards: expected true or false, got {shown(own_rewards)}")
         beside = given.parent if isinstance(given, Path) else None
         folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        layers.append(_Layer(data, name, folder, task if isinstance(found, Registered) else None, kind, reference_robot))
+        registered_as = task if isinstance(found, Registered) else None
+        layers.append(_Layer(data, name, folder, registered_as, kind, reference_robot, own_rewards))
         if parent is None:
             return layers
         others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
@@ -191,6 +197,10 @@ def _merged(
                 data, name = dict(rescaled), f"{name} (written for {Path(layer.reference_robot).name})"
                 origins.rescaled |= {name, f"{name}: cpu"}
         cpu = data.pop("cpu", {})
+        if layer.own_rewards:
+            merged.get("rewards", {}).pop("scales", None)
+            defaults = hints_of(schema)["rewards"]().scales  # type: ignore[arg-type]
+            merge(merged, {"rewards": {"scales": dict.fromkeys(defaults, 0.0)}}, layer.name, origins)
         merge(merged, data, name, origins)
         if on_cpu:
             merge(merged, cpu, f"{name}: cpu", origins)

@@ -91,6 +91,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
     def _allocate(self) -> None:
         """Allocate the tensors that all tasks have. There is one action for each joint that is not held."""
         self.num_actions = len(acted_joints(self.robot, self.cfg.control))
+        self._joints = {}
         super()._allocate()
 
     def _init_buffers(self) -> None:

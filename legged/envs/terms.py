@@ -16,6 +16,8 @@ from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorKind
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.physics import Physics
+from legged.robots.patterns import match_names
+from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
 TERMINATION_FORCE = 1.0
@@ -49,6 +51,8 @@ class Terms:
     cfg: LeggedConfig
     dt: float
     """Control step [s]."""
+    device: torch.device
+    robot: Robot
     physics: Physics
     base_pos: Tensor
     """(N, 3) position of the base in the world frame [m]. `base_quat` (N, 4) is its orientation (w, x, y, z)."""
@@ -75,6 +79,8 @@ class Terms:
     dof_vel_limits: Tensor
     torques: Tensor
     """(N, D) joint torques of the last physics step [N m]."""
+    _joints: dict[tuple[str, ...], Tensor]
+    """Patterns -> the tensor that `joints` returns for them."""
     actions: Tensor
     """(N, A) clipped actions of this step, one for each joint that is not held. `last_actions` are those of the previous
     step.
@@ -177,6 +183,19 @@ class Terms:
     def without_wheels(self, values: Tensor) -> Tensor:
         """Return `values` (N, D), one for each joint, without the columns of wheels."""
         return values if self._without_wheels is None else values.index_select(1, self._without_wheels)
+
+    def joints(self, pattern: str, *others: str) -> Tensor:
+        """Return the indices (K,) of the joints whose names contain any of the patterns, in the robot's order, such as
+        `self.dof_pos[:, self.joints("hip", "knee")]`. Every call with the same patterns returns the same tensor.
+
+        Raises:
+            ConfigError: a pattern is empty or matches no joint.
+        """
+        patterns = (pattern, *others)
+        if patterns not in self._joints:
+            found = match_names(patterns, self.robot.joint_names, f"{type(self).__name__}.joints")
+            self._joints[patterns] = torch.tensor(found, dtype=torch.long, device=self.device)
+        return self._joints[patterns]
 
     def _force(self, units: float) -> float:
         """Return `units` times the contact threshold of this robot's feet [N]."""

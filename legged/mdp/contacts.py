@@ -41,18 +41,19 @@ class FeetContacts:
     ) -> None:
         """Clear all times and contacts. `dt` is the control step [s]; `force` is the threshold of a contact [N]."""
         self.dt, self._kernels, self.force = dt, kernels, force
-        # The five masks and times are views of two tensors, so that a reset takes only two kernel launches.
+        # The six masks and times are views of two tensors, so that a reset takes only two kernel launches.
         self._flags = torch.zeros(num_envs, 3, num_feet, dtype=torch.bool, device=device)
-        self._times = torch.zeros(num_envs, 2, num_feet, device=device)
+        self._times = torch.zeros(num_envs, 3, num_feet, device=device)
         self.in_contact, self.first_contact, self._touching = self._flags.unbind(dim=1)
         """(N, F) masks of the feet that are on the ground, and of those that touched down at this step."""
-        self.air_time, self.last_air_time = self._times.unbind(dim=1)
-        """(N, F) duration of the current swing, 0 in contact; and duration of the last finished swing [s]."""
+        self.air_time, self.last_air_time, self.contact_time = self._times.unbind(dim=1)
+        """(N, F) duration of the current swing, 0 in contact; of the last finished swing; and of the current stance, 0 in the
+        air [s]."""
 
     def update(self, feet_forces: Tensor) -> None:
         """Advance by one control step. `feet_forces` (N, F, 3) are the contact forces of the feet in the world frame [N]."""
         if self._kernels is not None:
-            times = (self.air_time, self.last_air_time)
+            times = (self.air_time, self.last_air_time, self.contact_time)
             flags = (self.in_contact, self.first_contact, self._touching)
             self._kernels.advance_feet(feet_forces, self.force, self.dt, *flags, *times)
             return
@@ -65,6 +66,7 @@ class FeetContacts:
         self.air_time.add_(self.dt)
         torch.where(self.first_contact, self.air_time, self.last_air_time, out=self.last_air_time)
         self.air_time.masked_fill_(self.in_contact, 0.0)
+        self.contact_time.add_(self.dt).mul_(self.in_contact)
 
     def reset(self, mask: Tensor) -> None:
         """Reset contacts and times of the robots in `mask` (N,)."""

@@ -163,6 +163,39 @@ def test_a_mistake_in_an_override_is_blamed_on_the_command_line(write):
     assert "did you mean 'num_envs'?" in message
 
 
+# ---- rewards of one's own --------------------------------------------------------------------------------------------
+
+
+def rewards_of(cfg) -> dict[str, float]:
+    return {name: scale for name, scale in cfg.rewards.scales.items() if scale}
+
+
+def test_with_own_rewards_only_the_scales_of_the_file_and_its_children_count(write):
+    write(
+        "first",
+        "rewards: {tracking_sigma: 0.5, scales: {orientation: -3.0, torques: -1.0}}\n"
+        "cpu: {rewards: {scales: {stumble: -1, dof_acc: -1}}}\n",
+    )
+    text = "extends: first\nown_rewards: true\nrewards: {scales: {torques: -0.2}}\ncpu: {rewards: {scales: {torques: -9}}}\n"
+    own = load_config(write("own", text), "own")
+    assert rewards_of(own) == {"torques": -0.2}
+    assert own.rewards.tracking_sigma == 0.5
+    assert "orientation" not in own.rewards.scales
+    assert own.origins.where("rewards.scales.action_rate").endswith("own.yaml: rewards.scales.action_rate")
+    assert rewards_of(from_dict(to_dict(own))) == {"torques": -0.2}
+    child = load_config(write("child", "extends: own\nrewards: {scales: {collision: -1.0}}\n"), "child", on_cpu=True)
+    assert rewards_of(child) == {"torques": -9.0, "collision": -1.0}
+
+
+def test_own_rewards_need_no_parent_and_stand_at_the_top_of_a_file(write):
+    assert rewards_of(load_config(write("alone", "own_rewards: true\n"), "alone")) == {}
+    assert rewards_of(load_config({"own_rewards": False}, "same")) == LeggedConfig().rewards.scales
+    assert error_of(write("mine", "own_rewards: 1\n")).endswith("mine.yaml: own_rewards: expected true or false, got 1")
+    assert "cpu: own_rewards: unknown key" in error_of(write("mine", "cpu: {own_rewards: true}\n"))
+    assert "rewards.own_rewards: unknown key" in error_of(write("mine", "rewards: {own_rewards: true}\n"))
+    assert "command line: own_rewards: unknown key" in error_of(write("mine", ""), [("own_rewards", True)])
+
+
 # ---- the cpu section -------------------------------------------------------------------------------------------------
 
 CPU = "env: {num_envs: 100, seed: 5}\ncpu:\n  env: {num_envs: 10}\n  rewards: {scales: {torques: -9}}\n"

@@ -13,6 +13,7 @@ from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.rewards import Rewards
 from legged.robots.robot import load_robot
+from legged.state import StateError, load_state, state_of
 
 CPU = torch.device("cpu")
 DT = 0.02
@@ -263,22 +264,25 @@ def test_a_swing_is_timed_from_lift_off_to_touch_down():
     forces = [200.0, 200.0, 0.0, 0.0, 0.5, 0.0, 200.0, 200.0]
     in_contact = [True, True, True, False, False, False, True, True]
     air_time = [0.0, 0.0, 0.0, 0.02, 0.04, 0.06, 0.0, 0.0]
+    contact_time = [0.02, 0.04, 0.06, 0.0, 0.0, 0.0, 0.02, 0.04]
     for step in range(8):
         feel(contacts, forces[step], 100.0)
         assert contacts.in_contact.tolist() == [[in_contact[step], True]]
         assert contacts.first_contact.tolist() == [[step == 6, False]]
         assert contacts.air_time[0].tolist() == pytest.approx([air_time[step], 0.0])
         assert contacts.last_air_time[0].tolist() == pytest.approx([0.08 if step >= 6 else 0.0, 0.0])
+        assert contacts.contact_time[0].tolist() == pytest.approx([contact_time[step], 0.02 * (step + 1)])
 
 
 def test_one_missing_sample_does_not_split_a_stance():
     contacts = FeetContacts(1, 1, DT, CPU)
     feel(contacts, 200.0)
-    for force in (200.0, 0.0, 200.0, 0.0, 200.0):
+    for step, force in enumerate((200.0, 0.0, 200.0, 0.0, 200.0)):
         feel(contacts, force)
         assert contacts.in_contact.item()
         assert not contacts.first_contact.item()
         assert contacts.air_time.item() == 0.0
+        assert contacts.contact_time.item() == pytest.approx(DT * (step + 2))
 
 
 def test_a_reset_forgets_the_swing_of_the_masked_robots_only():
@@ -291,6 +295,17 @@ def test_a_reset_forgets_the_swing_of_the_masked_robots_only():
     assert contacts.last_air_time.flatten().tolist() == pytest.approx([0.0, 0.08])
     contacts.update(torch.tensor([0.0, 0.0, 200.0]).expand(2, 1, 3))
     assert contacts.first_contact.flatten().tolist() == [False, True]
+    contacts.reset(mask(False, True))
+    assert contacts.contact_time.flatten().tolist() == pytest.approx([0.02, 0.0])
+
+
+def test_a_state_that_was_saved_before_stances_were_timed_does_not_fit():
+    """A resumed run begins new episodes then, as with any state that does not fit."""
+    contacts = FeetContacts(2, 4, DT, CPU)
+    saved = state_of(contacts)
+    saved["_times"] = saved["_times"][:, :2].clone()
+    with pytest.raises(StateError, match=r"FeetContacts\._times is \(2, 2, 4\) float32, not \(2, 3, 4\)"):
+        load_state(contacts, saved)
 
 
 # ---- control ---------------------------------------------------------------------------------------------------------

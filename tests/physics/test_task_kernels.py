@@ -78,7 +78,7 @@ def test_feet_swing_and_stand_alike():
             part.update(shapes[:, 3:13:3])
             part.reset(torch.arange(N) == step)
         assert_same(parts)
-    assert parts[0].last_air_time.unique().numel() > 5
+    assert min(parts[0].last_air_time.unique().numel(), parts[0].contact_time.unique().numel()) > 5
 
 
 @pytest.mark.parametrize("heading", [False, True])

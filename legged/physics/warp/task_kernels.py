@@ -55,8 +55,9 @@ def advance_feet(
     touched: wp.array2d[wp.bool],
     air_time: wp.array2d[float],
     last_air_time: wp.array2d[float],
+    contact_time: wp.array2d[float],
 ):
-    """Update the feet's contacts and air times. One thread per robot and foot."""
+    """Update the feet's contacts and times. One thread per robot and foot."""
     robot, foot = wp.tid()
     touching = forces[robot, foot][2] > threshold
     contact = touching or touched[robot, foot]
@@ -71,6 +72,7 @@ def advance_feet(
     first_contact[robot, foot] = first
     touched[robot, foot] = touching
     air_time[robot, foot] = air
+    contact_time[robot, foot] = wp.where(contact, contact_time[robot, foot] + dt, 0.0)
 
 
 @wp.kernel
