@@ -4,10 +4,15 @@ The layout is rsl-rl's (actor_state_dict, critic_state_dict, optimizer_state_dic
 adds are in `infos`.
 """
 
+import hashlib
+import inspect
 import io
 import math
 import pickle
+import textwrap
+import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +20,11 @@ import torch
 from torch import Tensor
 
 from legged.config import LeggedConfig, TaskConfig
-from legged.config.networks import NETWORKS, groups_of
+from legged.config.networks import NETWORKS, groups_in, groups_of
 from legged.envs import BaseTask
 from legged.errors import ConfigError
 from legged.learning.recurrent import rnn_of
-from legged.learning.run_folder import FROM_LEGGED_GYM
+from legged.learning.run_folder import FROM_LEGGED_GYM, checkpoints
 from legged.process.paths import relative, write_bytes
 from legged.robots.robot import load_robot
 
@@ -47,6 +52,7 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
         path.open("rb").close()
     except OSError as error:
         raise ConfigError(f"{name}: cannot be read ({error.strerror or error})") from error
+    _check_sums(path)
     try:
         return torch.load(path, weights_only=True, map_location=device)
     except pickle.UnpicklingError as error:
@@ -55,6 +61,28 @@ def load_plain(path: Path, device: str = "cpu") -> Any:
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
     except Exception as error:  # torch raises half a dozen types of errors for a foreign file
         raise ConfigError(f"{name}: not a checkpoint ({_first_line(error)})") from error
+
+
+def _check_sums(path: Path) -> None:
+    """Compare the parts of a torch file with their checksums, which torch.load ignores.
+
+    Raises:
+        ConfigError: the file is damaged. The message names the newest other checkpoint before it in its folder.
+    """
+    if not zipfile.is_zipfile(path):
+        return  # torch.load tells what the file is
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # zipfile raises half a dozen types of errors for a damaged archive
+        damaged = _first_line(error)
+    if damaged is None:
+        return
+    saved = checkpoints(path.parent)
+    iteration = next((number for number, other in saved.items() if other == path), math.inf)
+    older = max((number for number in saved if number < iteration), default=None)
+    hint = "" if older is None else f"; use an older one: --checkpoint {older} ({saved[older].name})"
+    raise ConfigError(f"{relative(path)}: not a checkpoint any more: the file is damaged (wrong checksum: {damaged}){hint}")
 
 
 def _first_line(error: Exception) -> str:
@@ -115,6 +143,7 @@ INFOS: dict[str, Kind] = {
     "learning_rate": float,
     "wall_s": float,
     "evaluation": {str: float},
+    "terms": {str: str},
 }
 """Entry -> allowed type: one type, a tuple of types, or {type of the keys: type of the values}."""
 
@@ -194,8 +223,24 @@ def describe(task: BaseTask) -> dict[str, Any]:
         "histories": {name: group.history for name, group in task.observation_groups.items()},
         "networks": networks(task.cfg),
         "optimizer": task.cfg.train.algorithm.optimizer,
+        "terms": digests(type(task), task.cfg),
         **({} if robot is None else {"robot": {"name": robot.name, "joints": list(robot.joint_names)}}),
     }
+
+
+def digests(kind: type[BaseTask], cfg: TaskConfig) -> dict[str, str]:
+    """Return method -> SHA-256 of its source, for the terms that `cfg` names. Sources that can't be read are left out."""
+    named = {
+        "_reward_": cfg.rewards.scales,
+        "_terminate_": (*cfg.terminations.failures, *cfg.terminations.time_outs),
+        "_obs_": [term for group in groups_in(cfg).values() for term in group.terms],
+    }
+    found = {}
+    for method in sorted(prefix + name for prefix, names in named.items() for name in names):
+        with suppress(AttributeError, OSError, TypeError):  # e.g. the class was typed into an interpreter
+            source = textwrap.dedent(inspect.getsource(getattr(kind, method)))
+            found[method] = hashlib.sha256(source.encode()).hexdigest()
+    return found
 
 
 def observation_layout(task: BaseTask) -> dict[str, dict[str, int]]:

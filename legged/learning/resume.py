@@ -7,7 +7,7 @@ from typing import Any
 from legged.config import LeggedConfig, TaskConfig, override, to_dict
 from legged.config.dotted import value_at
 from legged.errors import ConfigError
-from legged.learning.checkpoint import check_fits, check_optimizer, read_checkpoint
+from legged.learning.checkpoint import check_fits, check_optimizer, digests, read_checkpoint
 from legged.learning.run_folder import find_checkpoint, find_run, run_config
 from legged.process.paths import relative
 from legged.registry import task_class, task_config
@@ -22,8 +22,8 @@ KEPT = ("train.algorithm.class_name", "train.distillation.teacher")
 def resumed(
     task: str, asked: Iterable[tuple[str, Any]], load_run: str | None, iteration: int | str | None
 ) -> tuple[TaskConfig, Path, list[str]]:
-    """Return the configuration to continue with, the checkpoint to continue from, and a line for each setting that `asked`
-    changes.
+    """Return the configuration to continue with, the checkpoint to continue from, and what has changed: a line for each
+    setting that `asked` changes, and one that names the terms whose code has changed since the checkpoint.
 
     `load_run` names a run of the task, or is None for the newest. `iteration` is a number, 'best', or None for the latest.
     All errors are found here, before anything is built.
@@ -58,7 +58,10 @@ def resumed(
         raise ConfigError(
             f"--resume: {relative(path)} has finished {done} iterations of {until}; --max-iterations sets a larger total"
         )
-    return cfg, path, changes(before, cfg, (key for key, _ in asked))
+    then, now = saved["infos"].get("terms", {}), digests(task_class(cfg.task), cfg)
+    edited = ", ".join(method for method in now if then.get(method, now[method]) != now[method])
+    lines = changes(before, cfg, (key for key, _ in asked))
+    return cfg, path, [*lines, f"the code of {edited} has changed since"] if edited else lines
 
 
 def changes(before: TaskConfig, after: TaskConfig, asked: Iterable[str]) -> list[str]:

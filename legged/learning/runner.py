@@ -106,6 +106,7 @@ class Runner(OnPolicyRunner):
         self._state: dict[str, Any] | None = None
         self._transferred_from: dict[str, Any] | None = None
         self._last_saved = ""
+        self._description = describe(env)  # the sources of the terms may be edited during the training
         self.evaluations: Evaluations | None = None
         """Evaluations of the policy during training. With several processes, only the first has them."""
         keep_std_in_bounds(self.alg.get_policy(), self.alg.optimizer)
@@ -251,7 +252,7 @@ class Runner(OnPolicyRunner):
         saved["iter"] = self.current_learning_iteration
         saved["infos"] = {
             **(infos or {}),
-            **describe(self.env),
+            **self._description,
             "task_state": self.env.progress(),
             "learning_rate": self.alg.learning_rate,
             "wall_s": time.perf_counter() - STARTED_S,  # since the start of this process

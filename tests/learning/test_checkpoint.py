@@ -12,9 +12,13 @@ from legged.cli.evaluate import checkpoints as evaluate_checkpoints
 from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.play import play
 from legged.cli.train import train
+from legged.config import to_yaml
+from legged.envs import LeggedRobot
 from legged.errors import ConfigError
-from legged.learning.checkpoint import FORMAT, read_checkpoint
+from legged.learning.checkpoint import FORMAT, digests, networks, read_checkpoint
+from legged.learning.resume import resumed
 from legged.learning.run_folder import shipped_policy
+from legged.registry import task_config
 
 pytestmark = pytest.mark.usefixtures("workplace")
 COMMANDS = {
@@ -263,3 +267,46 @@ def test_a_checkpoint_that_does_not_say_its_sizes_is_read_by_its_weights(model):
     layers = {f"mlp.{i}.weight": torch.zeros(shape) for i, shape in ((0, (16, 5)), (2, (4, 16)), (4, (2, 4)))}
     normalised = {"obs_normalizer._mean": torch.zeros(1, 5), **layers}
     assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True, **plain}
+
+
+def test_a_flipped_bit_is_noticed_and_an_older_checkpoint_named(tmp_path):
+    """The bit is in the fraction of a weight, so the file is a checkpoint still and the weight is finite."""
+    weights = torch.full((64,), 1.5)
+    paths = [tmp_path / f"model_{iteration}.pt" for iteration in (3, 20, 100)]
+    for path in paths:
+        torch.save({"actor_state_dict": {"w": weights}, "iter": 20}, path)
+        assert torch.equal(read_checkpoint(path)["actor_state_dict"]["w"], weights)
+    content = bytearray(paths[1].read_bytes())
+    content[content.index(weights.numpy().tobytes()) + 2] ^= 1
+    paths[1].write_bytes(content)
+    assert not torch.equal(torch.load(paths[1], weights_only=True)["actor_state_dict"]["w"], weights)
+    with pytest.raises(ConfigError, match=r"model_20\.pt: .*damaged.*--checkpoint 3 \(model_3\.pt\)$"):
+        read_checkpoint(paths[1])
+    paths[0].unlink()
+    with pytest.raises(ConfigError, match=r"model_20\.pt: .*damaged \(wrong checksum: [\w/]+\)$"):
+        read_checkpoint(paths[1])
+
+
+def test_a_resumed_training_names_the_terms_whose_code_has_changed():
+    cfg = task_config(TASK)
+    here = digests(LeggedRobot, cfg)
+    assert {"_reward_torques", "_obs_dof_pos", "_terminate_contact"} <= here.keys()
+
+    class Edited(LeggedRobot):
+        def _reward_torques(self):
+            return self.torques.abs().sum(dim=1)
+
+    assert {method for method, digest in digests(Edited, cfg).items() if digest != here[method]} == {"_reward_torques"}
+    folder = Path("logs") / TASK / "run"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(to_yaml(cfg))
+    infos = {"networks": networks(cfg), "terms": digests(Edited, cfg) | {"_reward_old": "0"}}
+    content = {"actor_state_dict": {}, "critic_state_dict": {}, "optimizer_state_dict": {}, "iter": 0, "infos": infos}
+    torch.save(content, folder / "model_0.pt")
+    assert resumed(TASK, [], None, None)[2] == ["the code of _reward_torques has changed since"]
+    infos["terms"] = here
+    torch.save(content, folder / "model_0.pt")
+    assert resumed(TASK, [], None, None)[2] == []
+    del infos["terms"]
+    torch.save(content, folder / "model_0.pt")
+    assert resumed(TASK, [], None, None)[2] == []
