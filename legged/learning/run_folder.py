@@ -18,7 +18,7 @@ from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.learning.invocation import INVOCATION_FILE
-from legged.process.paths import data_folder, exists, make_folder, not_made, relative, write_bytes, write_text
+from legged.process.paths import data_folder, exists, listed, make_folder, not_made, relative, write_bytes, write_text
 from legged.registry import YAML_ENDINGS, register_file, task_config, task_names, task_schema
 
 LOGS = Path("logs")
@@ -140,7 +140,7 @@ def find_run(cfg: TaskConfig, load_run: str | None) -> Path:
         ConfigError: there is no such run.
     """
     parent = experiment_folder(cfg)
-    runs = sorted((p for p in parent.glob("*") if checkpoints(p)), key=_last_saved)
+    runs = sorted((p for p in listed(parent) if checkpoints(p)), key=_last_saved)
     if load_run in (None, "-1"):
         if not runs:
             shipped = ", and the package has no policy of this task"
@@ -179,7 +179,7 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
         name = register_file(name, where)
     if name in task_names():
         experiment = experiment_folder(task_config(name))
-        runs = [run for run in experiment.glob("*") if is_run(run)]
+        runs = [run for run in listed(experiment) if is_run(run)]
         shipped = shipped_policy(name)
         if not runs and shipped is None:
             raise ConfigError(
@@ -188,10 +188,10 @@ def run_named(name: str, where: str, begun: bool = False) -> Path:
         return max(runs, key=_last_saved) if runs else shipped or experiment
     with suppress(OSError, ValueError):
         for folder in (parent / name for parent in (Path(), LOGS) if name.strip()):
-            runs = [run for run in folder.glob("*") if is_run(run)]
+            runs = [run for run in listed(folder) if is_run(run)]
             if runs:
                 return max(runs, key=_last_saved)
-    known = [f"{run.parent.name}/{run.name}" for run in LOGS.glob("*/*") if is_run(run)]
+    known = [f"{run.parent.name}/{run.name}" for run in _runs_in_logs() if is_run(run)]
     if exists(Path(name)) and Path(name).is_dir():
         said = f"there is no {CONFIG_FILE} in it or in its folders{_remedy(Path(name))}"
         raise ConfigError(f"{where}: {shown(name)} holds no run: {said}")
@@ -220,10 +220,14 @@ def newest_run(where: str) -> Path:
     Raises:
         ConfigError: there is no run.
     """
-    runs = [run for run in LOGS.glob("*/*") if _has_begun(run)]
+    runs = [run for run in _runs_in_logs() if _has_begun(run)]
     if not runs:
         raise ConfigError(f"{where}: there is no run in {LOGS}/; train one first, or name a task whose policy is shipped")
     return max(runs, key=_last_saved)
+
+
+def _runs_in_logs() -> list[Path]:
+    return [run for experiment in listed(LOGS) for run in listed(experiment)]
 
 
 def _has_begun(folder: Path) -> bool:
@@ -302,7 +306,7 @@ def _remedy(folder: Path) -> str:
 def checkpoints(folder: Path) -> dict[int, Path]:
     """Return the checkpoints of a folder, sorted by iteration. A shipped policy has the iteration 0."""
     found: dict[int, Path] = {}
-    for path in folder.glob("model*.pt"):
+    for path in listed(folder, "model*.pt"):
         match = re.fullmatch(r"model_(\d+)\.pt", path.name, re.ASCII)
         if not path.is_file():  # skip folders and broken links
             continue

@@ -3,6 +3,7 @@ atomically, and that check in advance if a folder can be written.
 """
 
 import errno
+import fnmatch
 import itertools
 import os
 import re
@@ -20,6 +21,8 @@ ABANDONED_S = 3600.0
 """Age at which an unfinished file counts as left over from a killed process [s]."""
 LONGEST_NAME = 255
 """Longest name of a file or folder on common file systems [bytes]."""
+NO_FOLDER = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+"""Errors of the system for names that are not those of folders."""
 _REASONS = {errno.ENOSPC: DISK_FULL, errno.EDQUOT: f"{DISK_FULL} (the quota is used up)"}
 _COUNTER = itertools.count()
 
@@ -51,6 +54,22 @@ def exists(path: Path) -> bool:
         return path.exists()
     except (OSError, ValueError):
         return False
+
+
+def listed(folder: Path, pattern: str = "*") -> list[Path]:
+    """Return the entries of a folder whose names match a pattern; none if there is no such folder.
+
+    Raises:
+        RunError: the folder can't be read. Path.glob would return nothing.
+    """
+    try:
+        return [folder / name for name in fnmatch.filter(os.listdir(folder), pattern)]
+    except ValueError:
+        return []
+    except OSError as error:
+        if error.errno in NO_FOLDER:
+            return []
+        raise RunError(f"{relative(folder)}: the folder can't be read: {reason(error)}") from error
 
 
 def reason(error: OSError) -> str:

@@ -1,5 +1,7 @@
 """Run folders: whose they are, what is written into them, and when there is none."""
 
+import errno
+import os
 import shutil
 import subprocess
 import threading
@@ -13,6 +15,7 @@ from helpers import TASK, TINY_TRAINING, call, run_folders, small_config, tiny_r
 import legged.cli.train
 from legged.cli.train import train
 from legged.errors import ConfigError, RunError
+from legged.evaluation.reports.record import folders_in
 from legged.learning import run_folder as runs
 from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config
 from legged.mdp.actuator_network import NetworkWeights
@@ -239,6 +242,27 @@ def test_somebody_elses_repository_is_not(installed, place):
 def test_without_git_that_is_said(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert code_state().splitlines()[1:] == ["git is not on the PATH, so the commit is unknown"]
+
+
+@pytest.mark.parametrize("closed", [f"logs/{TASK}", "logs"])
+def test_a_folder_of_runs_that_cannot_be_read_does_not_lead_to_the_shipped_policy(monkeypatch, closed):
+    """A user who may read everything finds no closed folder, so the system's answer is made up."""
+    entries = os.listdir
+
+    def listdir(folder):
+        if str(folder).startswith(closed):
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return entries(folder)
+
+    monkeypatch.setattr(os, "listdir", listdir)
+    for find in (lambda: runs.run_named(TASK, "POLICY"), lambda: runs.find_run(small_config(), None)):
+        with pytest.raises(RunError, match=rf"^logs/{TASK}: the folder can't be read: Permission denied$"):
+            find()
+    for find in (lambda: runs.newest_run("POLICY"), lambda: folders_in(Path("logs"))):
+        with pytest.raises(RunError if closed == "logs" else ConfigError):
+            find()
+    monkeypatch.setattr(os, "listdir", entries)
+    assert runs.run_named(TASK, "POLICY") == runs.shipped_policy(TASK)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from legged.evaluation.result_file import file_name, read_results
 from legged.learning.invocation import Invocation, read_invocation
 from legged.learning.run_folder import CODE_FILE, CONFIG_FILE, NOTE_FILE, checkpoints, of_another_policy, run_config
 from legged.learning.timing import Timing, read_timing
+from legged.process.paths import exists, listed
 from legged.registry import task_config
 
 FILMS = ("film.gif", "play.gif", "play.mp4")
@@ -134,9 +135,12 @@ def folders_in(path: Path) -> list[Path]:
 
     Raises:
         ConfigError: there is no run folder.
+        RunError: a folder can't be read.
     """
-    levels = [sorted(path.glob("/".join(["*"] * depth + [CONFIG_FILE]))) for depth in range(DEEPEST)]
-    folders = [file.parent for level in levels for file in level]
+    levels = [[path]]
+    for _ in range(DEEPEST - 1):
+        levels.append(sorted(inside for folder in levels[-1] for inside in listed(folder)))
+    folders = [folder for level in levels for folder in level if exists(folder / CONFIG_FILE)]
     if not folders:
         raise ConfigError(f"{path}: holds no run folder (there is no {CONFIG_FILE} in it)")
     return folders
