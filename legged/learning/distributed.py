@@ -1,13 +1,18 @@
 """Communication between the processes of a training on several GPUs."""
 
 import os
+import sys
+import threading
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from legged.errors import ConfigError
+from legged.errors import ConfigError, RunError
 from legged.process.ranks import Ranks
+
+PATIENCE_S = 10.0
+"""Time after which a process says that it waits for the others [s]."""
 
 
 class RankLost(Exception):
@@ -29,15 +34,32 @@ def check_reachable(ranks: Ranks) -> None:
 
 
 def join(ranks: Ranks, device: torch.device) -> None:
-    """Join the process group, with NCCL on GPUs and gloo on the CPU. Do nothing if the process has already joined."""
+    """Join the process group, with NCCL on GPUs and gloo on the CPU. Do nothing if the process has already joined. A process
+    that waits for others says so.
+
+    Raises:
+        ConfigError: as for `check_reachable`.
+        RunError: the other processes do not come.
+    """
     if dist.is_initialized():
         return
     check_reachable(ranks)
-    if device.type == "cuda":
-        torch.cuda.set_device(device)
-        dist.init_process_group("nccl", rank=ranks.rank, world_size=ranks.count, device_id=device)
-    else:
-        dist.init_process_group("gloo", rank=ranks.rank, world_size=ranks.count)
+    where = f"rank {ranks.rank} at {os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+    text = f"{where}: waiting for the others of {ranks.count} processes"
+    waiting = threading.Timer(PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
+    waiting.daemon = True
+    waiting.start()
+    try:
+        if device.type == "cuda":
+            torch.cuda.set_device(device)
+            dist.init_process_group("nccl", rank=ranks.rank, world_size=ranks.count, device_id=device)
+        else:
+            dist.init_process_group("gloo", rank=ranks.rank, world_size=ranks.count)
+    except dist.DistError as error:
+        reason = str(error).splitlines()[0]
+        raise RunError(f"{where}: the {ranks.count} processes did not meet; start all of them ({reason})") from error
+    finally:
+        waiting.cancel()
 
 
 def leave() -> None:

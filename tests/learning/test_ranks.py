@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import queue
 import re
 import shlex
 import signal
@@ -18,7 +19,8 @@ from helpers import HANG_S, TASK, TINY_TRAINING, call, checkpoints, run_folders,
 import legged
 from legged.cli.train import train
 from legged.commandline.arguments import pick_device
-from legged.errors import ConfigError
+from legged.errors import ConfigError, RunError
+from legged.learning import distributed
 from legged.process.ranks import Ranks
 from legged.registry import make_task, task_config
 
@@ -90,6 +92,35 @@ def wait_for_iterations(process) -> None:
         assert process.poll() is None, Path("out.txt").read_text()
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_a_process_that_waits_for_others_says_so(monkeypatch):
+    said = queue.SimpleQueue()
+
+    class Error:
+        write, flush = staticmethod(said.put), staticmethod(lambda: None)
+
+    def meet(*_args, **_kwargs):
+        heard.append(said.get(timeout=HANG_S))
+
+    heard: list[str] = []
+    monkeypatch.setenv("MASTER_ADDR", "10.0.0.1")
+    monkeypatch.setenv("MASTER_PORT", "29500")
+    monkeypatch.setattr(distributed, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(distributed.dist, "init_process_group", meet)
+    monkeypatch.setattr(sys, "stderr", Error)
+    distributed.join(Ranks(1, 0, 3, 1), torch.device("cpu"))
+    assert heard == ["rank 1 at 10.0.0.1:29500: waiting for the others of 3 processes"]
+
+    def time_out(*_args, **_kwargs):
+        raise distributed.dist.DistStoreError("Timed out after 1801 seconds waiting for clients.\nmore")
+
+    monkeypatch.setattr(distributed, "PATIENCE_S", HANG_S)
+    monkeypatch.setattr(distributed.dist, "init_process_group", time_out)
+    with pytest.raises(
+        RunError, match=r"^rank 1 at 10\.0\.0\.1:29500: .* did not meet.*\(Timed out after 1801 .* clients\.\)$"
+    ):
+        distributed.join(Ranks(1, 0, 3, 1), torch.device("cpu"))
 
 
 @pytest.mark.slow
