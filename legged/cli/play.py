@@ -39,6 +39,8 @@ from legged.rendering.camera import window_opens
 
 ROOM_MB = 24.0
 """Disk space for the film and the exported policy [MiB]."""
+MOST_ROBOTS = 4096
+"""Largest number of robots. More would take minutes to build, and gigabytes."""
 MOST_SHOWN = 9
 """Largest number of robots that the film shows on a plane."""
 SHOWN_ON_A_PLANE = 4
@@ -70,6 +72,9 @@ def play(args: argparse.Namespace) -> int:
     settle_on(device)
     policy = policy_of(_named(args), args.checkpoint)
     asked = policy_overrides(args)
+    count = dict(asked).get("env.num_envs", 1)
+    if isinstance(count, int) and count > MOST_ROBOTS:
+        raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}; a film shows at most {MOST_SHOWN}")
     folder = args.out or policy.output("play")
     if isinstance(policy.cfg, LeggedConfig):
         playground, task, act = _on_ground(args, policy, asked, device, folder)

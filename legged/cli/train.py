@@ -51,7 +51,7 @@ from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
 from legged.process.ranks import Ranks
 from legged.process.startup import program, stage_ended
-from legged.registry import make_task, task_config
+from legged.registry import make_task, task_class, task_config
 
 ROOM_MB = 16.0
 """Disk space that must be free before a training begins, for its first checkpoints [MiB]."""
@@ -102,6 +102,7 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
     check_commands(cfg)
     check_tracker(cfg)
+    _check_rewards(cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -152,6 +153,18 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
         return 0
     # Even without a signal to this process, a training stops if its output is lost or if another process gets a signal.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
+
+
+def _check_rewards(cfg: TaskConfig) -> None:
+    """Check that a task that learns from rewards has one, unless its class has its own `compute_reward`.
+
+    Raises:
+        ConfigError: all scales are 0, or there are none.
+    """
+    own = task_class(cfg.task).compute_reward is not BaseTask.compute_reward
+    if not (own or learns_from_teacher(cfg) or any(cfg.rewards.scales.values())):
+        known = ", ".join(sorted(task_class(cfg.task).terms("_reward_")))
+        raise ConfigError(f"{cfg.task}: rewards.scales: no reward has a scale other than 0 (rewards: {known})")
 
 
 def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:

@@ -166,8 +166,10 @@ def pick_device(name: str | None, flag: str = "--sim-device") -> torch.device:
         device = torch.device(name)
     except RuntimeError as error:
         raise ConfigError(f"{flag}: '{name}' is not a device (allowed: cpu, cuda, cuda:0, ...)") from error
+    if device.type == "cpu" and device.index in (None, 0):
+        return torch.device("cpu")
     if device.type == "cpu":
-        return device
+        raise ConfigError(f"{flag}: '{name}': there is one device 'cpu'; sim.threads sets the number of cores")
     if device.type != "cuda":
         raise ConfigError(f"{flag}: '{name}' is not supported (allowed: cpu, cuda, cuda:0, ...)")
     if not torch.cuda.is_available():

@@ -96,6 +96,11 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
             raise ConfigError(f"{name}: extends: the chain of `extends` has more than {LONGEST_CHAIN} files")
         seen.append(_mark(found))
         data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
+        if data.get("task", own := Path(task).name.removesuffix(".yaml").removesuffix(".yml")) != own:
+            said = f"{shown(data['task'])}; remove this key"
+            raise ConfigError(
+                f"{name}: task: the name of this task is '{own}', got {said}, or extend that task with `extends`"
+            )
         if isinstance(data.get("cpu"), Mapping):
             data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
         parent, kind, reference_robot = (data.pop(key, None) for key in ("extends", "class", "written_for"))

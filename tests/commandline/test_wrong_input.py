@@ -16,6 +16,8 @@ from legged.cli.benchmark import step
 from legged.cli.evaluate import grid
 from legged.cli.play import play
 from legged.cli.train import train
+from legged.commandline.arguments import pick_device
+from legged.registry import task_config
 
 SMALLER = (
     'observations.groups.actor.terms=["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel"]'  # 33 numbers
@@ -181,6 +183,20 @@ def test_a_number_of_robots_is_not_evaluate_s_to_choose(fails, run):
     fails(grid.main, task("--num_envs", "5"), "--num-envs")
 
 
+@pytest.mark.parametrize("number", [["--num-envs", "1000000"], ["env.num_envs=4097"]])
+def test_a_film_of_more_robots_than_can_be_built_soon(fails, number):
+    fails(play.main, task(*number), "--num-envs: must be from 1 to 4096, got", "a film shows at most 9")
+
+
+def test_a_training_without_a_reward(fails, tmp_path):
+    scales = task_config(TASK).rewards.scales
+    nothing = dict.fromkeys(scales, 0.0)
+    (tmp_path / "unpaid.yaml").write_text(f"extends: {TASK}\nrewards: {{scales: {json.dumps(nothing)}}}\n")
+    expected = "unpaid: rewards.scales: no reward has a scale other than 0 (rewards: action_rate, ang_vel_xy,"
+    fails(train.main, ["unpaid.yaml", "--sim-device", "cpu"], expected)
+    assert call(train.main, ["unpaid.yaml", "--sim-device", "cpu", "--show", "rewards.scales.torques=-1"]) == 0
+
+
 def test_a_number_of_iterations_that_cannot_be(fails):
     fails(train.main, task("--max_iterations", "0"), "train.runner.max_iterations: must be at least 1")
 
@@ -212,6 +228,11 @@ def test_a_gpu_where_there_is_none(fails, flag, name):
 @pytest.mark.parametrize("name", ["nonsense", "gpu", "cuda:x", "meta", "mps"])
 def test_a_device_that_is_none(fails, main, name):
     fails(main, [TASK, "--sim_device", name], "--sim-device", f"'{name}'", "allowed: cpu, cuda")
+
+
+def test_a_number_of_the_cpu(fails):
+    fails(train.main, [TASK, "--sim-device", "cpu:5"], "--sim-device: 'cpu:5': there is one device 'cpu'", "sim.threads")
+    assert pick_device("cpu:0") == pick_device("cpu") == torch.device("cpu")
 
 
 # ---- runs and checkpoints --------------------------------------------------------------------------------------------

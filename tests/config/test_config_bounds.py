@@ -259,6 +259,19 @@ def test_a_wrong_cpu_section_is_named(tmp_path, section):
     assert str(error.value).startswith(f"{path}: cpu: ")
 
 
+def test_a_task_is_named_by_its_file(tmp_path):
+    """The key `task` is in the configuration of a run, which somebody may copy."""
+    for name in ("mine", "child"):
+        (tmp_path / f"{name}.yaml").write_text(f"extends: {TASK if name == 'mine' else 'mine.yaml'}\ntask: {name}\n")
+        assert load_config(tmp_path / f"{name}.yaml", name).task == name
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: {TASK}\ntask: {TASK}\n")
+    for name in ("mine", "child"):
+        with pytest.raises(ConfigError) as error:
+            load_config(tmp_path / f"{name}.yaml", name)
+        assert str(error.value).startswith(f"{path}: task: the name of this task is 'mine', got '{TASK}'; remove this key")
+
+
 def test_keys_are_text(tmp_path):
     path = tmp_path / "mine.yaml"
     for text, words in (
