@@ -139,10 +139,12 @@ def _guarded(main: Callable[[list[str] | None], int], argv: list[str] | None) ->
         if text is None:
             from legged.user_modules import is_of_a_module  # a late import, because `legged --help` must stay fast
 
-            if not is_of_a_module(_file_of(error)):
+            if is_of_a_module(_file_of(error)):
+                _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
+                return EXIT_WRONG_INPUT
+            if not (isinstance(error, OSError) and error.filename):
                 raise
-            _say(f"{type(error).__name__}: {' '.join(str(error).split())}{line_of_user(error)}")
-            return EXIT_WRONG_INPUT
+            text = f"{error.filename}: {reason(error)}{line_of_user(error)}"  # e.g. a folder that was deleted meanwhile
         _say(text)
     return EXIT_FAILED
 
@@ -207,10 +209,16 @@ class Output:
         self._when_lost: list[Callable[[], object]] = []
 
     def write(self, text: str) -> int:
-        """Write a text, or discard it if it can't be written; return the number of characters."""
+        """Write a text, or discard it if it can't be written; return the number of characters. A character that the stream's
+        encoding lacks is written as a question mark.
+        """
         if self.lost is None:
             with self._watched():
-                self._stream.write(text)
+                try:
+                    self._stream.write(text)
+                except UnicodeEncodeError:  # the stream's encoding lacks a character
+                    encoding = self._stream.encoding
+                    self._stream.write(text.encode(encoding, "replace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
@@ -229,8 +237,6 @@ class Output:
     def _watched(self) -> Iterator[None]:
         try:
             yield
-        except UnicodeError:  # the stream works, but its encoding lacks a character
-            raise
         except (OSError, ValueError) as error:  # a closed stream raises ValueError
             self.lost = _why(error)
             if self._stream in (sys.__stdout__, sys.__stderr__):  # a flush at Python's exit must not fail

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from legged.process.deferred_compiler import defer_compiler
+from legged.process.requirements import say_unmet
 
 STARTED_S = time.perf_counter()
 """Time at which this package was first imported, on the clock of `time.perf_counter` [s]."""
@@ -130,4 +131,5 @@ def raise_at_interrupts() -> None:
 if command_of_ours():
     leave_at_interrupts()
     defer_compiler()
+    sys.excepthook = say_unmet
     gc.disable()  # `is_a_command` switches it on again

@@ -17,7 +17,7 @@ from legged.config.loader import merge, nest
 from legged.config.origins import Origins
 from legged.config.yaml_files import dump
 from legged.errors import ConfigError, RunError
-from legged.figures import DPI
+from legged.figures import DPI, import_matplotlib
 from legged.process.paths import make_folder, relative, replacing, write_text
 from legged.sweeping.plan import Plan
 from legged.tables import markdown_table
@@ -382,6 +382,7 @@ def draw_figures(trials: Trials) -> list[Path]:
     Raises:
         RunError: a file can't be written.
     """
+    import_matplotlib()
     import matplotlib.pyplot as plt
     from optuna.importance import PedAnovaImportanceEvaluator
     from optuna.visualization import matplotlib as drawing

@@ -111,3 +111,14 @@ def test_a_task_may_be_a_file_beside_that_of_the_sweep():
     text = Path("logs/sweep_search/table.md").read_text()
     assert "`short_cheetah`, for the last return" in text
     assert "legged train mine/short_cheetah.yaml train.algorithm.gamma=0.9" in text
+
+
+def test_figures_import_matplotlib_as_those_of_other_commands_do(monkeypatch):
+    """An unknown MPLBACKEND is a warning there, and else an error of matplotlib."""
+
+    def imported():
+        raise InterruptedError
+
+    monkeypatch.setattr("legged.sweeping.trials.import_matplotlib", imported)
+    with pytest.raises(InterruptedError):
+        draw_figures(None)

@@ -57,11 +57,15 @@ def test_what_cannot_be_written_is_dropped_and_who_waits_for_it_is_told_once(err
     assert told == ["early", "late"]
 
 
-def test_a_letter_that_a_terminal_lacks_is_no_lost_output():
-    output = Output(io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
-    with pytest.raises(UnicodeEncodeError):
-        output.write("ü")
+@pytest.mark.parametrize(
+    ("encoding", "written"), [("ascii", b"? ? 1\n"), ("latin-1", b"\xfc ? 1\n"), ("cp437", b"\x81 ? 1\n")]
+)
+def test_a_letter_that_a_terminal_lacks_is_a_question_mark(encoding, written):
+    output = Output(io.TextIOWrapper(io.BytesIO(), encoding=encoding, newline="\n"))
+    assert output.write("ü ⚠ 1\n") == 6
+    output.flush()
     assert output.lost is None
+    assert output.buffer.getvalue() == written
 
 
 def test_a_process_without_standard_output_has_one_that_takes_everything(monkeypatch):
@@ -127,6 +131,16 @@ def test_an_ended_command_says_why_in_one_line(error, code, line, capsys):
 
     assert run_main(command, []) == code
     assert capsys.readouterr().err == f"{line}\n"
+
+
+def test_a_folder_that_was_deleted_meanwhile_is_one_line(capsys, tmp_path):
+    def command(_argv):
+        (tmp_path / "logs" / "a.json").write_text("")
+
+    assert run_main(command, []) == 1
+    err = capsys.readouterr().err
+    assert err.startswith(f"error: {tmp_path}/logs/a.json: No such file or directory (")
+    assert err.count("\n") == 1
 
 
 def test_what_a_library_makes_of_a_full_disk_is_called_a_full_disk(capsys):
