@@ -18,6 +18,7 @@ from legged.config.checks import shown
 from legged.config.networks import groups_of
 from legged.envs.final_observation import keep_final_step
 from legged.errors import ConfigError, suggest
+from legged.learning.run_state import kept_generators
 from legged.registry import make_task, task_config
 from legged.rendering.camera import ModelCamera, RobotsCamera, camera_of
 
@@ -80,7 +81,7 @@ class TaskVectorEnv(VectorEnv):  # type: ignore[misc]
             settings.append(("sim.physics", physics))
         cfg = task_config(task, settings, on_cpu=self._device.type == "cpu")
         self._random: list[Tensor] | None = None
-        with self._own_random_numbers():
+        with kept_generators(torch.device("cpu")), self._own_random_numbers():
             self.task: Any = make_task(cfg, self._device, graph=False)
             """The task, a `legged.envs.BaseTask`. An environment whose episode has ended is already in its next episode."""
             # On a GPU, keep_final_step captures the step and the copies of the final state as one CUDA graph.

@@ -17,8 +17,8 @@ class EnvConfig:
     episode_length_s: float = field(default=20.0, metadata=quantity("s", positive(LONGEST_S, low=1e-5)))
     """Time-out of an episode [s]."""
     seed: int = field(default=1, metadata=between(0, 2**62))
-    """Seed of torch's random numbers and of the terrain. Physics uses no random numbers. With several GPUs, each
-    process adds its rank to the seed of torch's random numbers; the terrain is the same in all processes."""
+    """Seed of the terrain and of the random numbers of torch, Python and NumPy. Physics uses none. With several GPUs, each
+    process adds its rank to the seed of random numbers; the terrain is the same in all processes."""
 
 
 @dataclass(frozen=True)

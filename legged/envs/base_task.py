@@ -21,7 +21,7 @@ from legged.envs.checks import check_task
 from legged.envs.final_observation import StepWatcher
 from legged.envs.judging import JudgingTask
 from legged.envs.marks import concurrent
-from legged.envs.observing import ObservingTask
+from legged.envs.observing import ObservingTask, of_one_shape
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.envs.saved import SavedTask
 from legged.errors import ConfigError
@@ -33,6 +33,7 @@ from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool
 from legged.physics import Scene
 from legged.process.ranks import Ranks
+from legged.state import seed_host
 
 
 class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
@@ -66,7 +67,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         """Control step [s]."""
         self.max_episode_length = round(cfg.env.episode_length_s / cfg.dt)
         """Steps of a full episode."""
-        torch.manual_seed(cfg.env.seed + Ranks.now().rank)  # random numbers differ between GPUs
+        seed = cfg.env.seed + Ranks.now().rank  # random numbers differ between GPUs
+        torch.manual_seed(seed)
+        seed_host(seed)
         self.randomization = self.make_randomization()
         self._build_physics(self.make_scene())
         self.num_actions = self.physics.ctrl.shape[1]
@@ -154,7 +157,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
         groups = groups_in(cfg)
         # The terms of the largest group come first, so that their columns in `observation_terms` are adjacent.
         in_order = [name for group in sorted(groups.values(), key=lambda g: -len(g.terms)) for name in group.terms]
-        self.observation_terms = ObservationTerms(self._methods("_obs_", dict.fromkeys(in_order)))
+        self.observation_terms = ObservationTerms(
+            {name: of_one_shape(term) for name, term in self._methods("_obs_", dict.fromkeys(in_order)).items()}
+        )
         self.observation_terms.errors = self.make_observation_errors()
         self.observation_groups: dict[str, ObservationGroup] = {name: self._group(name) for name in groups}
         self.nan_guard = NanGuard(self.rewards.names, self.observation_terms, self.num_envs, self.device)  # type: ignore[arg-type]

@@ -1,6 +1,10 @@
 """Observation groups of a task, and the simulated sensor errors of the groups with noise."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
+
+from torch import Tensor
 
 from legged.config.networks import groups_in
 from legged.config.schema import TaskConfig
@@ -8,6 +12,23 @@ from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.observation_errors import HEIGHTS, ObservationErrors
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool
+
+
+def of_one_shape(term: Callable[[], Tensor]) -> Callable[[], Tensor]:
+    """Return a function that calls `term` and raises ValueError if the shape differs from the one of the first call."""
+    first: Any = None
+
+    @functools.wraps(term)
+    def checked() -> Tensor:
+        nonlocal first
+        value = term()
+        shape = getattr(value, "shape", None)
+        first = shape if first is None else first
+        if shape != first:
+            raise ValueError(f"returned a tensor {tuple(shape or ())}, but {tuple(first)} in its first call")
+        return value
+
+    return checked
 
 
 class ObservingTask:

@@ -21,6 +21,7 @@ from legged.policies.actor import Actor
 from legged.policies.episodes import unit_of
 from legged.policies.restore import nominal
 from legged.registry import make_task, task_class
+from legged.state import seed_host
 
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""
@@ -128,6 +129,7 @@ class TrainingEvaluation:
         device = torch.device(task.device)
         with kept_generators(device), ordinary_tensors():
             torch.default_generator.manual_seed(task.cfg.env.seed)
+            seed_host(task.cfg.env.seed)
             if device.type == "cuda":
                 torch.cuda.default_generators[device.index].manual_seed(task.cfg.env.seed)
             self._actor.network.load_state_dict(policy.state_dict())

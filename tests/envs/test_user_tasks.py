@@ -1,11 +1,14 @@
 """Tasks of users: YAML files, modules and registered mappings, the robots they name; and their mistakes, in one line each."""
 
+import random
 import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers import TASK, call, forget_modules_of, tiny_run
+import torch
+from helpers import ENGINE, TASK, call, forget_modules_of, small_task, tiny_run
 
 from legged import LeggedRobot, registry, user_modules
 from legged.cli.episodes import compare
@@ -13,7 +16,9 @@ from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.train import train
 from legged.config import from_dict
 from legged.config.loader import read_yaml
-from legged.errors import ConfigError
+from legged.errors import ConfigError, TermError
+from legged.gymnasium_envs import TaskVectorEnv
+from legged.learning.run_state import kept_generators
 from legged.robots.robot import load_robot
 
 pytestmark = pytest.mark.usefixtures("workplace", "own_registry")
@@ -328,3 +333,41 @@ def test_a_file_with_the_name_of_a_loaded_module_does_not_replace_it(error):
 def test_a_wrong_registered_configuration_is_named(error, config, words):
     written("my_tasks.py", f"import legged\nlegged.register('mine', {config})\n")
     assert words in error("--import", "my_tasks.py", "--task", "mine")
+
+
+def test_an_observation_whose_width_changes_is_named():
+    widths = iter([3, 3])
+
+    class Odd(LeggedRobot):
+        def _obs_odd(self):
+            return self.commands[:, : next(widths, 2)]
+
+    groups = {"actor": {"terms": ["odd", "dof_pos"]}, "critic": {"terms": ["dof_pos"]}}
+    registry.register(
+        "odd", {"extends": TASK, "observations": {"groups": groups}, "train": {"algorithm": {"symmetry": False}}}, Odd
+    )
+    cfg = registry.task_config("odd", [("env.num_envs", 4), *ENGINE], on_cpu=True)
+    with pytest.raises(TermError, match=r"^_obs_odd: returned a tensor \(4, 2\), but \(4, 3\) in its first call"):
+        registry.make_task(cfg)
+
+
+def test_the_seed_is_that_of_python_and_numpy_too_and_torch_draws_as_before():
+    def drawn(seed: int):
+        small_task(("env.seed", seed))
+        return random.random(), np.random.random(), torch.get_rng_state().tolist()
+
+    with kept_generators(torch.device("cpu")):
+        first, other, again = drawn(3), drawn(2**62), drawn(3)
+        random.seed(5)
+        assert drawn(3)[2] == first[2]
+    assert first == again
+    assert all(a != b for a, b in zip(first, other, strict=True))
+
+
+def test_an_environment_of_gymnasium_leaves_the_generators_of_its_program_alone():
+    with kept_generators(torch.device("cpu")):
+        random.seed(7)
+        np.random.seed(8)
+        expected = random.Random(7).random(), np.random.RandomState(8).random_sample()
+        TaskVectorEnv(TASK, 2, config=dict(ENGINE))
+        assert (random.random(), np.random.random()) == expected
