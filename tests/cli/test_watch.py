@@ -13,7 +13,7 @@ from legged.cli.train import train
 from legged.cli.watch import watch
 from legged.commandline.arguments import watch_command
 from legged.errors import ConfigError
-from legged.play.live.page import HOST, PORT, free_port, is_loopback, url
+from legged.play.live.page import HOST, PORT, free_port, is_loopback, is_own, url
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -68,6 +68,31 @@ def test_another_port_is_found_where_the_usual_one_is_taken_but_not_where_one_wa
     assert free_port(HOST, 0) > 0
     with pytest.raises(ConfigError, match=r"--host: 'no\.such\.host\.invalid' is no address"):
         free_port("no.such.host.invalid", None)
+
+
+@pytest.mark.parametrize(
+    ("served", "host", "origin", "allowed"),
+    [
+        (HOST, "127.0.0.1:8470", "http://127.0.0.1:8470", True),
+        (HOST, "localhost:9000", "http://localhost:9000", True),  # a forwarded port
+        (HOST, "localhost:9000", None, True),
+        (HOST, "evil.example:8470", "http://evil.example:8470", False),  # a name that was led here
+        (HOST, "evil.example:8470", None, False),
+        (HOST, "127.0.0.1:8470", "http://evil.example", False),
+        (HOST, "127.0.0.1:8470", "http://127.0.0.1:9999", False),  # another server of this machine
+        (HOST, "127.0.0.1:8470", "null", False),
+        (HOST, "127.0.0.1.evil.example:8470", None, False),
+        (HOST, "[:8470", None, False),
+        (HOST, None, None, False),
+        ("0.0.0.0", "192.168.1.7:8470", "http://192.168.1.7:8470", True),
+        ("0.0.0.0", f"{socket.gethostname().upper()}:8470", f"http://{socket.gethostname().upper()}:8470", True),
+        ("0.0.0.0", "evil.example:8470", "http://evil.example:8470", False),
+        ("::", "[fe80::1]:8470", "http://[fe80::1]:8470", True),
+        ("gpu1.lab", "gpu1.lab:8470", "https://gpu1.lab:8470", True),
+    ],
+)
+def test_a_page_answers_its_own_pages_alone(served, host, origin, allowed):
+    assert is_own(served, host, origin) == allowed
 
 
 class HeldPort:

@@ -1,6 +1,7 @@
 """The page of a live view: its server, its controls, and what a browser makes of it. Needs the extra `watch`."""
 
 import contextlib
+import http.client
 import io
 import shutil
 import signal
@@ -17,7 +18,7 @@ from helpers import ENGINE, HANG_S, POLICY, POLICY_ITERATION, TASK, until, wait_
 from PIL import Image
 
 from legged.learning.run_folder import run_config
-from legged.play.live.page import HOST, Page, free_port, url
+from legged.play.live.page import HOST, Page, free_port, load_viser, refusing_other_sites, url
 from legged.play.live.session import Session, Watched, changes_for, check_ground
 
 pytest.importorskip("viser", reason="the extra `watch` is not installed")
@@ -62,6 +63,34 @@ def labels(page: Page) -> list[str]:
     """What the controls of a page are called."""
     handles = page.server.gui._gui_input_handle_from_uuid.values()
     return [handle.label for handle in handles]
+
+
+@pytest.mark.parametrize("served", [HOST, "0.0.0.0"])
+def test_the_server_refuses_other_websites(served):
+    with contextlib.redirect_stdout(io.StringIO()), refusing_other_sites(served):
+        server = load_viser().ViserServer(host=served, port=free_port(served, 0), verbose=False)
+    try:
+        own = f"{HOST}:{server.get_port()}"
+        upgrade = {
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Key": "a" * 22 + "==",
+            "Sec-WebSocket-Version": "13",
+        }
+        for headers, status in [
+            ({"Host": own}, 200),
+            ({"Host": "evil.example"}, 403),
+            ({"Host": own, "Origin": f"http://{own}", **upgrade}, 101),
+            ({"Host": own, "Origin": "http://evil.example", **upgrade}, 403),
+            ({"Host": "evil.example", "Origin": "http://evil.example", **upgrade}, 403),
+        ]:
+            connection = http.client.HTTPConnection(own, timeout=HANG_S)
+            connection.request("GET", "/", headers=headers)
+            assert connection.getresponse().status == status, headers
+            connection.close()
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 @pytest.mark.slow

@@ -6,9 +6,11 @@ import ipaddress
 import queue
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from http import HTTPStatus
 from typing import Any
+from urllib.parse import urlsplit
 
 from legged.errors import ConfigError
 from legged.learning.run_folder import BEST
@@ -74,6 +76,45 @@ def url(host: str, port: int) -> str:
     return f"http://{shown}:{port}"
 
 
+def is_own(served: str, host: str | None, origin: str | None) -> bool:
+    """Return whether a request is from a page at `served` (--host), by its headers Host and Origin. Another website can lead
+    its own name to this machine, so Host must be an address, `served`, or a name of this machine. Origin must be the same
+    place as Host; programs other than browsers send no Origin.
+    """
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        own = name in {served.lower(), "localhost", socket.gethostname().lower()} or bool(ipaddress.ip_address(name))
+    except ValueError:
+        own = False
+    return own and (origin is None or origin.partition("://")[2] == host)
+
+
+@contextlib.contextmanager
+def refusing_other_sites(served: str) -> Iterator[None]:
+    """Make every server of `websockets` that starts in the block refuse requests that are not `is_own`. Viser has no setting
+    for this.
+    """
+    from websockets.asyncio import server
+
+    serve: Any = server.serve
+
+    def guarded(*args: Any, process_request: Any = None, **settings: Any) -> Any:
+        def check(connection: Any, request: Any) -> Any:
+            host, origins = request.headers.get("Host"), request.headers.get_all("Origin")
+            if len(origins) < 2 and is_own(served, host, *(origins or [None])):
+                return process_request(connection, request) if process_request is not None else None
+            text = f"{host!r} is not this page: use the machine's address, or start `legged watch` with --host NAME\n"
+            return connection.respond(HTTPStatus.FORBIDDEN, text)
+
+        return serve(*args, process_request=check, **settings)
+
+    server.serve = guarded  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
+
+
 def load_viser() -> Any:
     """Return the module viser.
 
@@ -99,7 +140,7 @@ class Page:
 
         self.session = session
         self._asked: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        with contextlib.redirect_stdout(io.StringIO()), refusing_other_sites(host):  # viser prints a banner
             self.server: Any = viser.ViserServer(host=host, port=port, label=session.task.cfg.task, verbose=False)
         self.port = int(self.server.get_port())
         # Viser would let any visitor publish the page through a public tunnel. This is switched off here.
