@@ -1,5 +1,7 @@
 """An exported policy for one robot: readings and commands -> observations -> policy.onnx -> joint targets."""
 
+import threading
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,10 @@ from legged.errors import ConfigError
 
 WARM_UP = 20
 """Number of trial runs after the network is loaded. The first runs of a network take ten times as long as later runs."""
+WARM_UP_S = 10.0
+"""Longest time of all trial runs [s]."""
+MOST_BYTES = 2**30
+"""Largest memory of networks for what they compute; their weights do not count [bytes]."""
 
 
 def gravity_in(quaternion: np.ndarray) -> np.ndarray:
@@ -26,12 +32,43 @@ def open_onnx(path: Path) -> onnxruntime.InferenceSession:
         ConfigError: the file cannot be read.
     """
     try:
+        _limit_memory()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
+        options.add_session_config_entry("session.use_env_allocators", "1")
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises errors without a common class
         raise ConfigError(f"{path}: onnxruntime cannot read it: {' '.join(str(error).split())}") from error
+
+
+@cache
+def _limit_memory() -> None:
+    """Make an allocator with the limit MOST_BYTES, for all sessions of `open_onnx` together."""
+    kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
+    memory = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
+    onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": MOST_BYTES}))
+
+
+def warm_up(path: Path, session: onnxruntime.InferenceSession, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """Run the network of the file `path` WARM_UP times with the same `inputs`. Return its last outputs.
+
+    Raises:
+        ConfigError: the network fails. It may take more than WARM_UP_S or need more than MOST_BYTES.
+    """
+    options = onnxruntime.RunOptions()
+    options.log_severity_level = 4
+    timer = threading.Timer(WARM_UP_S, setattr, [options, "terminate", True])
+    timer.daemon = True
+    timer.start()
+    try:
+        return [session.run(None, inputs, options) for _ in range(WARM_UP)][-1]  # type: ignore[no-any-return]
+    except Exception as error:  # onnxruntime raises errors without a common class
+        why = f"longer than {WARM_UP_S:g} s" if options.terminate else " ".join(str(error).split())
+        limits = f"it may use {WARM_UP_S:g} s and {MOST_BYTES / 2**30:g} GiB"
+        raise ConfigError(f"{path}: {WARM_UP} trial runs of the network failed ({limits}): {why}") from error
+    finally:
+        timer.cancel()
 
 
 class Network:
@@ -42,7 +79,7 @@ class Network:
 
         Raises:
             ConfigError: the file cannot be read, has other sizes than the contract, comes from another export than the
-                contract, or gives actions that are not finite.
+                contract, gives actions that are not finite, or needs too much time or memory.
         """
         self._session, self._states = open_onnx(path), contract.states
         contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
@@ -52,13 +89,12 @@ class Network:
         if list(found.items()) != list(wanted.items()):  # the batch size is a name, so `found` lacks it
             raise ConfigError(f"{path}: has the inputs {found}, but policy.json says {wanted}")
         self.restart()
-        for _ in range(WARM_UP):
-            actions = self.run(np.zeros(contract.width, dtype=np.float32))
+        zeros = np.zeros((1, contract.width), dtype=np.float32)
+        actions = np.asarray(warm_up(path, self._session, {"obs": zeros, **self._hidden})[0])[0]
         if actions.shape != contract.acted.shape:
             raise ConfigError(f"{path}: gives {actions.size} actions, but policy.json says {len(contract.acted)}")
         if not np.isfinite(actions).all():
             raise ConfigError(f"{path}: gives actions that are not finite for an observation of zeros")
-        self.restart()
 
     def restart(self) -> None:
         """Clear the hidden state."""

@@ -17,7 +17,7 @@ from legged.config.checks import build
 from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.deploy.contract import Contract, read_contract
-from legged.deploy.policy import open_onnx
+from legged.deploy.policy import open_onnx, warm_up
 from legged.errors import ConfigError, suggest
 from legged.mdp.actuator import is_ideal
 from legged.process.paths import data_folder, exists
@@ -171,8 +171,8 @@ class ForeignPolicy:
         """Load the ONNX file at `path`. The attribute `metadata` holds the texts in the file's metadata by name.
 
         Raises:
-            ConfigError: the file cannot be read, its joints are not the robot's, its sizes are not the layout's, or the
-                layout is the contract of another export.
+            ConfigError: the file cannot be read, its joints are not the robot's, its sizes are not the layout's, the
+                layout is the contract of another export, or the network needs too much time or memory.
         """
         self.layout, self._path, self._session = layout, path, open_onnx(path)
         self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
@@ -244,6 +244,7 @@ class ForeignPolicy:
         count = len(self._acted)
         if isinstance(outputs[0].shape[1], int) and outputs[0].shape[1] != count:
             raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, but {count} joints have an action")
+        warm_up(self._path, self._session, {self._input: np.zeros((1, width), dtype=np.float32)})
 
     def reset(self) -> None:
         """Start an episode."""

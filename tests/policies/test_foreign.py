@@ -183,3 +183,47 @@ def test_metadata_that_does_not_fit_the_robot(policy_file):
     ):
         with pytest.raises(ConfigError, match=message):
             ForeignPolicy(policy_file(matrix, bias, **metadata), layout, robot)
+
+
+def network(nodes, tensors) -> bytes:
+    """An ONNX file: obs (1, WIDTH) -> actions (1, 12)."""
+    numbers = [numpy_helper.from_array(value, name) for name, value in tensors.items()]
+    obs, actions = (
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, size]) for name, size in (("obs", WIDTH), ("actions", 12))
+    )
+    graph = helper.make_graph(nodes, "policy", [obs], [actions], numbers)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8).SerializeToString()
+
+
+def endless() -> bytes:
+    """A network with a loop of 10^12 rounds."""
+    state = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, WIDTH]) for name in ("s", "s2")]
+    flags = [helper.make_tensor_value_info(name, TensorProto.BOOL, []) for name in ("c", "c2")]
+    nodes = [helper.make_node("Identity", ["c"], ["c2"]), helper.make_node("Add", ["s", "s"], ["s2"])]
+    count = helper.make_tensor_value_info("i", TensorProto.INT64, [])
+    body = helper.make_graph(nodes, "body", [count, flags[0], state[0]], [flags[1], state[1]])
+    tensors = {"n": np.array(10**12), "on": np.array(True), "w": np.zeros((WIDTH, 12), np.float32)}
+    loop = helper.make_node("Loop", ["n", "on", "obs"], ["looped"], body=body)
+    return network([loop, helper.make_node("MatMul", ["looped", "w"], ["actions"])], tensors)
+
+
+def huge() -> bytes:
+    """A network that computes with 2 GiB."""
+    tensors = {"shape": np.array([2**16, 2**13]), "w": np.zeros((WIDTH, 12), np.float32)}
+    nodes = [
+        helper.make_node("ReduceMax", ["obs"], ["one"], keepdims=1),
+        helper.make_node("Expand", ["one", "shape"], ["much"]),
+        helper.make_node("ReduceMax", ["much"], ["again"], keepdims=1),
+        helper.make_node("MatMul", ["obs", "w"], ["product"]),
+        helper.make_node("Add", ["product", "again"], ["actions"]),
+    ]
+    return network(nodes, tensors)
+
+
+@pytest.mark.parametrize(("content", "words"), [(endless, "longer than 0.05 s"), (huge, "[Mm]emory")])
+def test_a_network_that_takes_all_time_or_memory_is_refused(content, words, tmp_path, monkeypatch):
+    monkeypatch.setattr("legged.deploy.policy.WARM_UP_S", 0.05 if content is endless else 600.0)
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(content())
+    with pytest.raises(ConfigError, match=rf"policy\.onnx: 20 trial runs of the network failed .* 1 GiB\): .*{words}"):
+        ForeignPolicy(path, read_layout("holosoma", "--layout"), load_robot("anymal_c"))
