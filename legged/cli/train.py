@@ -156,10 +156,10 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
 
 
 def _check_rewards(cfg: TaskConfig) -> None:
-    """Check that a task that learns from rewards has one, unless its class has its own `compute_reward`.
+    """Check that a task that learns from rewards has a reward, unless its class overrides `compute_reward`.
 
     Raises:
-        ConfigError: all scales are 0, or there are none.
+        ConfigError: all scales are 0, or `rewards.scales` is empty.
     """
     own = task_class(cfg.task).compute_reward is not BaseTask.compute_reward
     if not (own or learns_from_teacher(cfg) or any(cfg.rewards.scales.values())):
