@@ -35,15 +35,17 @@ def unmet() -> dict[str, str]:
 
 
 def say_unmet(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """Print an error that nothing has caught: in one line if unmet requirements may be its cause, else with its traceback.
-    The arguments are those of `sys.excepthook`.
+    """Print an error that nothing has caught. If requirements are unmet, a line names them; a failed import then has no
+    traceback. The arguments are those of `sys.excepthook`.
     """
+    at_import = isinstance(error, ImportError)
     try:
-        found = {text: what for text, what in unmet().items() if what != MISSING or isinstance(error, ImportError)}
+        found = {text: what for text, what in unmet().items() if what != MISSING or at_import}
     except Exception:  # without `packaging` or the list of requirements, nothing is known
         found = {}
-    if not found:
+    if not (found and at_import):
         sys.__excepthook__(kind, error, trace)
+    if not found:
         return
     packages = ", ".join(f"{text} ({what})" for text, what in found.items())
     install = " ".join(f"'{text}'" for text in found)
