@@ -3,6 +3,7 @@ methods.
 """
 
 import inspect
+import re
 from pathlib import Path
 from types import CodeType
 from typing import Any
@@ -10,11 +11,15 @@ from typing import Any
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.origins import Origins
 from legged.config.schema import TaskConfig
-from legged.errors import ConfigError, suggest
+from legged.errors import LONGEST, ConfigError, suggest
 from legged.process.paths import relative
 
 _OBSERVE = "write a method _obs_<name> for each observation; list <name> in observations.groups.actor.terms and .critic.terms"
 _STEP = "override a hook that _step() calls (advance, compute_reward, remember, ...), and call the parent's method in it"
+_SUBSTEP = (
+    "override take_actions() for code that runs once before a control step's physics, or apply_control() for code that runs"
+    " before each physics step, and call the parent's method in it"
+)
 _START = (
     "init_state.dof_pos_factor, init_state.yaw and init_state.base_velocity set the initial states; for other states,"
     " override reset_idx(mask) and call self.physics.write(mask, qpos, qvel) after super().reset_idx(mask)"
@@ -25,19 +30,24 @@ _TORQUES = "control.control_type, .stiffness and .damping set the control law; o
 _RANDOM = "domain_rand.ranges names the properties that are randomised (docs/randomisation.md)"
 
 HOOKS = {
-    # Methods of legged_gym and its forks.
+    # Methods of legged_gym, its forks and Isaac Lab that share a hint.
+    **dict.fromkeys(("post_physics_step", "_post_physics_step_callback", "_reset_buffers", "_call_train_eval"), _STEP),
+    **dict.fromkeys(("pre_physics_step", "post_decimation_step"), _SUBSTEP),
+    **dict.fromkeys(("_reset_dofs", "_reset_root_states"), _START),
+    **dict.fromkeys(
+        ("_create_envs", "_create_ground_plane", "_create_heightfield", "_create_trimesh", "create_sim", "_setup_scene"),
+        _BUILD,
+    ),
+    **dict.fromkeys(("_compute_torques", "_pre_physics_step", "_apply_action"), _TORQUES),
+    **dict.fromkeys(("_randomize_dof_props", "_randomize_rigid_body_props", "refresh_actor_rigid_shape_props"), _RANDOM),
+    **dict.fromkeys(("_draw_debug_vis", "render", "set_camera"), _DRAWING),
+    # Other methods of legged_gym and its forks.
     "_parse_cfg": "__init__() gets the complete configuration; your own numbers go under the key 'custom' in the YAML",
     "_prepare_reward_function": "rewards.scales in the YAML names the _reward_<name> methods that run; self.rewards has them",
-    "post_physics_step": _STEP,
-    "_post_physics_step_callback": _STEP,
-    "compute_observations": _OBSERVE,
     "get_privileged_observations": "observations.groups.critic.terms lists the _obs_<name> methods that the critic sees",
     "_get_noise_scale_vec": "observations.noise, noise_level and observations.add_noise in the YAML set the noise",
     "_resample_commands": "commands.ranges, commands.resampling_time_s, standing_share and single_axis_share set the"
     " sampling; another way of sampling goes into legged/mdp/commands.py",
-    "_compute_torques": _TORQUES,
-    "_reset_dofs": _START,
-    "_reset_root_states": _START,
     "_push_robots": "domain_rand.push_robots, push_interval_s and max_push_vel_xy set the pushes",
     "_update_terrain_curriculum": "terrain.curriculum switches it on; other rules go into legged/mdp/terrain_curriculum.py",
     "update_command_curriculum": "commands.curriculum configures it; other rules go into legged/mdp/command_curriculum.py",
@@ -46,39 +56,25 @@ HOOKS = {
     "_process_rigid_shape_props": "domain_rand.randomize_friction and friction_range set friction; all else is in the MJCF",
     "_process_dof_props": "joint and effort limits are in the MJCF, velocity limits in robot.yaml; rewards.soft_* scale them",
     "_process_rigid_body_props": "domain_rand.randomize_base_mass and added_mass_range add mass; all else is in the MJCF",
-    "_create_envs": _BUILD,
-    "_create_ground_plane": _BUILD,
-    "_create_heightfield": _BUILD,
-    "_create_trimesh": _BUILD,
     "_get_env_origins": "self.env_origins (N, 3) come from the terrain; terrain.spawn_range scatters robots around them",
-    "create_sim": _BUILD,
-    "_reset_buffers": _STEP,
     "_init_foot": "self.feet_pos and self.feet_vel (N, F, 3) exist already; allocate your own buffers in _init_buffers()",
     "update_feet_state": "self.feet_pos and self.feet_vel (N, F, 3) are current after every step",
-    "compute_self_observations": _OBSERVE,
     "compute_termination_observations": "keep_final_step(task) keeps the final observations of episodes"
     " (legged/envs/final_observation.py)",
     "_disturbance_robots": "domain_rand.forces and kicks push robots; for other disturbances override disturb(mask) and"
     " call self.physics.push",
     "_step_contact_targets": "override advance(), call super().advance() and write your own tensors in place",
-    "_call_train_eval": _STEP,
-    "_randomize_dof_props": _RANDOM,
-    "_randomize_rigid_body_props": _RANDOM,
+    "_fill_extras": "write a method _metric_<name> for each figure to be logged; step() returns its own extras",
     "_randomize_gravity": "domain_rand.ranges.gravity_x, _y and _z are added to gravity (docs/randomisation.md)",
-    "refresh_actor_rigid_shape_props": _RANDOM,
-    "_draw_debug_vis": _DRAWING,
-    "render": _DRAWING,
-    "set_camera": _DRAWING,
-    # Methods of Isaac Lab.
-    "_setup_scene": _BUILD,
-    "_pre_physics_step": _TORQUES,
-    "_apply_action": _TORQUES,
+    # Other methods of Isaac Lab.
     "_get_observations": _OBSERVE,
     "_get_rewards": "write a method _reward_<name> for each reward and set its scale in rewards.scales",
     "_get_dones": "write a method _terminate_<name> and list the name in terminations.failures or terminations.time_outs",
     "_reset_idx": "override reset_idx(mask), where mask has one bool per robot",
 }
 """Hook of another framework -> hint at its replacement in this package."""
+OBSERVES = re.compile(r"_?compute_\w*observations")
+"""Names of methods that compute observations in other frameworks, in addition to those in HOOKS."""
 OUTSIDE = {
     "step": "training runs _step() as a CUDA graph, not step(); override a hook of _step() and call the parent's hook in it",
     "get_observations": "training does not call it, but reads the buffers of observation_groups; " + _OBSERVE,
@@ -102,7 +98,8 @@ def check_overrides(cls: type) -> None:
 
     Raises:
         ConfigError: training would never call a method, and OWN_HELPERS does not list it; an override of a hook in EXTENDED
-            does not call super()'s method; or a constructor takes other arguments than (self, cfg, device, graph).
+            does not call super()'s method; or a constructor takes other arguments than (self, cfg, device, graph). The text
+            names all of these methods.
     """
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
@@ -110,23 +107,54 @@ def check_overrides(cls: type) -> None:
     for part in between:
         own = vars(part).get("OWN_HELPERS", ())
         helpers |= {own} if isinstance(own, str) else set(own)
+    wrong: dict[str, str] = {}
+    in_vain: list[str] = []
     for part in between:
-        for name in vars(part):
-            if name in helpers or not (name in OUTSIDE or (name in HOOKS and not hasattr(base, name))):
-                continue
-            vain = f"would have no effect: {OUTSIDE[name]}" if name in OUTSIDE else f"would never be called: {HOOKS[name]}"
-            raise ConfigError(
-                f"{place(part, vars(part)[name])}: {part.__name__}.{name} {vain}"
-                f" (if your own code calls it, write OWN_HELPERS = ('{name}',) in the class)"
-            )
-        for name in EXTENDED:
-            code = getattr(inspect.unwrap(vars(part).get(name, check_overrides)), "__code__", None)
-            if name in vars(part) and code is not None and name not in _names_in(code):
-                raise ConfigError(
-                    f"{place(part, vars(part)[name])}: {part.__name__}.{name} must call super().{name}(): {EXTENDED[name]}"
-                )
-        if "__init__" in vars(part):
-            _check_constructor(part)
+        for name, member in vars(part).items():
+            fault = ""
+            if name == "__init__":
+                fault = _constructor_fault(member)
+            elif name in EXTENDED and not _names(member, name):
+                fault = f"must call super().{name}(): {EXTENDED[name]}"
+            elif name not in helpers and (name in OUTSIDE or not hasattr(base, name)):
+                fault = never_called(name)
+                in_vain += [name] if fault else []
+            if fault:
+                wrong[f"{place(part, member)}: {part.__name__}.{name}"] = fault
+    if wrong:
+        names = f"'{in_vain[0]}'," if len(in_vain) == 1 else "..."
+        called = f" (if your own code calls it, write OWN_HELPERS = ({names}) in the class)" if in_vain else ""
+        raise ConfigError(_listed(wrong) + called)
+
+
+def _listed(wrong: dict[str, str]) -> str:
+    """Return the faults of methods as one text that fits into an error. `wrong` maps the place of a method to its fault.
+    Methods with the same fault share its words. If the text is too long, the last methods are named without their faults.
+    """
+    texts: list[str] = []
+    others: list[str] = []
+    for fault in dict.fromkeys(wrong.values()):
+        methods = [said for said in wrong if wrong[said] == fault]
+        text = f"{', '.join(methods)} {fault}"
+        if texts and sum(map(len, texts)) + len(text) > LONGEST // 2:
+            others += [said.rpartition(".")[2] for said in methods]
+        else:
+            texts.append(text)
+    return "; ".join(texts) + (f"; wrong too: {', '.join(others)}" if others else "")
+
+
+def never_called(name: str) -> str:
+    """Return what to write instead of a method `name` that training never calls; empty for any other name."""
+    if name in OUTSIDE:
+        return f"would have no effect: {OUTSIDE[name]}"
+    hint = HOOKS.get(name) or (_OBSERVE if OBSERVES.fullmatch(name) else "")
+    return f"would never be called: {hint}" if hint else ""
+
+
+def _names(member: Any, name: str) -> bool:
+    """Return whether the code of a method uses `name`. A member without code counts as one that does."""
+    code = getattr(inspect.unwrap(member), "__code__", None)
+    return code is None or name in _names_in(code)
 
 
 def _names_in(code: CodeType) -> set[str]:
@@ -135,22 +163,16 @@ def _names_in(code: CodeType) -> set[str]:
     return set(code.co_names).union(*(_names_in(constant) for constant in within))
 
 
-def _check_constructor(part: type) -> None:
-    """Check that the constructor of a class takes the arguments that the registry passes.
-
-    Raises:
-        ConfigError: the constructor takes other arguments.
-    """
-    constructor = vars(part)["__init__"]
+def _constructor_fault(constructor: Any) -> str:
+    """Return what is wrong with a constructor that does not take the arguments that the registry passes, else nothing."""
     try:
         inspect.signature(constructor).bind(None, None, "cpu", True)
     except TypeError as error:
-        raise ConfigError(
-            f"{place(part, constructor)}: {part.__name__}.__init__ must take (self, cfg, device, graph), without the"
-            f" arguments of Isaac Gym ({error}); allocate buffers in _init_buffers()"
-        ) from error
+        text = "must take (self, cfg, device, graph), without the arguments of Isaac Gym"
+        return f"{text} ({error}); allocate buffers in _init_buffers()"
     except ValueError:  # the constructor has no signature
-        return
+        pass
+    return ""
 
 
 KINDS = {"_reward_": "reward", "_obs_": "observation", "_terminate_": "termination"}

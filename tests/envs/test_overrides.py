@@ -9,8 +9,8 @@ from helpers import call, small_config
 
 from legged.cli.train import train
 from legged.envs import LeggedRobot
-from legged.envs.class_checks import EXTENDED, HOOKS
-from legged.errors import ConfigError
+from legged.envs.class_checks import EXTENDED, HOOKS, never_called
+from legged.errors import LONGEST, ConfigError
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -63,6 +63,12 @@ FORKS = [
     "_randomize_rigid_body_props",
     "_randomize_gravity",
     "refresh_actor_rigid_shape_props",
+    "pre_physics_step",
+    "post_decimation_step",
+    "_fill_extras",
+    "compute_group_observations",
+    "compute_proprioception_observations",
+    "_compute_observations",
 ]
 ISAAC_LAB = [
     "_setup_scene",
@@ -91,7 +97,8 @@ def test_a_hook_that_nobody_calls_is_refused_by_class_file_and_line(name):
         subclass(**{name: hook}).check(small_config())
     text = str(error.value)
     assert text.splitlines() == [text]
-    assert f"test_overrides.py:{line}: Mine.{name} would never be called: {HOOKS[name]}" in text
+    assert f"test_overrides.py:{line}: Mine.{name} would never be called: " in text
+    assert never_called(name) in text
     assert f"OWN_HELPERS = ('{name}',)" in text
 
 
@@ -131,6 +138,33 @@ def test_what_the_table_names_is_there():
     ):
         assert path in text
         functools.reduce(getattr, path.split("."), cfg)
+
+
+def test_all_wrong_methods_of_a_class_are_named_at_once():
+    """A class and its parent with three hooks that nothing calls, one that replaces what is done here, and a constructor."""
+    parent = subclass("Parent", compute_group_observations=hook)
+    mine = subclass(bases=(parent,), _fill_extras=hook, __init__=lambda self, sim: None, _push_robots=hook, remember=hook)
+    with pytest.raises(ConfigError) as error:
+        mine.check(small_config())
+    text = str(error.value)
+    for method in ("Mine._fill_extras", "Mine.__init__", "Mine._push_robots", "Mine.remember", "Parent.compute_group_observ"):
+        assert text.count(method) == 1
+    assert text.endswith("(if your own code calls it, write OWN_HELPERS = (...) in the class)")
+
+
+def test_no_wrong_method_is_lost_if_there_are_many():
+    with pytest.raises(ConfigError) as error:
+        subclass(**dict.fromkeys(LEGGED_GYM, hook)).check(small_config())
+    text = str(error.value)
+    assert all(re.search(rf"\b{name}\b", text) for name in LEGGED_GYM)
+    assert len(text) <= LONGEST
+    assert " ... " not in text  # which replaces the middle of a text that is too long
+
+
+def test_methods_with_observations_in_their_names_that_are_called_are_allowed():
+    subclass(compute_observation_of_feet=hook, observations=hook).check(small_config())
+    assert never_called("get_observations").startswith("would have no effect: ")
+    assert never_called("advance") == ""
 
 
 def test_hooks_of_a_class_between_and_of_a_mixin_are_found():
