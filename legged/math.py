@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
-from torch.nn.functional import mse_loss
+from torch.nn.functional import mse_loss, normalize
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
@@ -48,6 +48,21 @@ def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
     return roll, pitch, yaw_of(quat)
+
+
+def quat_apply_yaw(quat: Tensor, vec: Tensor) -> Tensor:
+    """Rotate vectors `vec` (N, 3) about the world's z axis by the turn about z in `quat` (N, 4), w first: by the quaternion
+    (w, 0, 0, z), normalised.
+    """
+    w, x, y, z = quat.unbind(dim=1)
+    turn = normalize(torch.stack([w, torch.zeros_like(x), torch.zeros_like(y), z], dim=1), dim=1)
+    return quat_rotate(turn, vec)
+
+
+def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
+    """Return the quaternions (N, 4), w first, of turns by `angle` (N,) [rad] about `axis`, (3,) or (N, 3), of any length."""
+    half = 0.5 * angle.unsqueeze(-1)
+    return torch.cat([torch.cos(half), torch.sin(half) * normalize(axis, dim=-1)], dim=-1)
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:

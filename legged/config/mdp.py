@@ -1,11 +1,13 @@
 """Sections of every task's Markov decision process: control, observations, rewards, terminations, randomisation."""
 
-from dataclasses import dataclass, field, replace
-from typing import Self
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
 from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry, rescaled_by_term
+from legged.config.origins import Origins
 from legged.config.randomization import DrawConfig, Range
+from legged.errors import suggest
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,18 @@ class RewardsConfig:
     """Multiply scales by the control step, so that sums of rewards over time do not depend on the control step."""
     only_positive_rewards: bool = False
     """Clip the sum of rewards (except `termination`) at zero, so that a robot can't avoid negative rewards by falling."""
+
+    if not TYPE_CHECKING:  # type checkers do not see __getattr__, so they still report misspelled settings
+
+        def __getattr__(self, name: str) -> Any:
+            """Return the number `custom.<name>`, as rewards of legged_gym read `self.cfg.rewards.<name>`."""
+            if name.startswith("_"):
+                raise AttributeError(name)
+            custom, origins = vars(self).get("_custom", ({}, Origins()))
+            if name in custom:
+                return custom[name]
+            near = suggest(name, [f.name for f in fields(self)] + list(custom), "settings")
+            raise AttributeError(f"{origins.where('custom')} has no '{name}', and neither has rewards{near}")
 
 
 @dataclass(frozen=True)

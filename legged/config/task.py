@@ -33,9 +33,14 @@ class TaskConfig:
     train: TrainConfig = field(default_factory=TrainConfig)
     """Settings of the learner."""
     custom: dict[str, Any] = field(default_factory=dict)
-    """Free section for user-defined terms, which read it as `self.cfg.custom["name"]`."""
+    """Free section for user-defined terms, which read it as `self.cfg.custom["name"]` or `self.cfg.rewards.name`."""
     origins: Origins = field(default_factory=Origins, repr=False, compare=False)
     """Sources of the settings. `compare=False` marks that this field is not a setting, so files neither set nor store it."""
+
+    def __post_init__(self) -> None:
+        rewards = replace(self.rewards)  # another configuration may hold the same section
+        object.__setattr__(rewards, "_custom", (self.custom, self.origins))
+        object.__setattr__(self, "rewards", rewards)
 
     def trained(self) -> Self:
         """Return the configuration for play and evaluation of a trained policy. Domain randomisation is off, and the settings

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
+from legged.robots.stance import lowest_point, stance
 
 FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
 """Unit vectors of the x axis and of gravity, and the identity orientation (x, y, z, w)."""
@@ -62,6 +63,50 @@ def _root_states(task: Any) -> Tensor:
     return torch.cat([task.base_pos, quat[:, 1:], quat[:, :1], velocity, quat_rotate(quat, task.base_ang_vel)], dim=1)
 
 
+def _once(task: Any, name: str, make: Callable[[Any], Any]) -> Any:
+    """Return `make(task)` of the first call with this `name`."""
+    made = vars(task).setdefault("_legged_gym", {})
+    if name not in made:
+        made[name] = make(task)
+    return made[name]
+
+
+def _sole_depths(task: Any) -> Tensor:
+    """Return (F,) how far each foot's lowest point is below its centre in the default pose [m]."""
+    model = task.physics.model
+    data = stance(model, task.robot.default_qpos)
+    feet = [[model.geom(name).id for name in foot] for foot in task.robot.feet_shapes]
+    depths = [data.geom_xpos[foot, 2].mean() - min(lowest_point(model, data, shape) for shape in foot) for foot in feet]
+    return torch.tensor(depths, dtype=torch.float32, device=task.device)
+
+
+def _foot_heights(task: Any) -> Tensor:
+    ground = task.height_scan.ground_at(task.feet_pos[:, :, :2])
+    return (task.feet_pos[:, :, 2] - _once(task, "sole_depths", _sole_depths) - ground).clamp(0.0, 1.0)
+
+
+def _feet_bodies(task: Any) -> Tensor:
+    """Return (F,) the indices of the feet's bodies in the model."""
+    bodies = [int(task.physics.model.geom(foot[0]).bodyid[0]) for foot in task.robot.feet_shapes]
+    return torch.tensor(bodies, device=task.device)
+
+
+def _feet_angle(axis: int) -> Callable[[Any], Tensor]:
+    """Return a function that computes the feet's roll (`axis` 0) or yaw (2), (N, F) [rad]."""
+
+    def read(task: Any) -> Tensor:
+        if "xquat" not in task.QUANTITIES:
+            raise AttributeError("needs the orientations of bodies; write QUANTITIES = ('xquat',) in the class")
+        quat = task.physics.quantity("xquat").index_select(1, _once(task, "feet_bodies", _feet_bodies))
+        return get_euler_xyz(quat.flatten(0, 1))[axis].view(quat.shape[:2])
+
+    return read
+
+
+def _rpy(task: Any) -> Tensor:
+    return torch.stack(get_euler_xyz(task.base_quat), dim=1)
+
+
 def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Wrap `get` so that it raises an AttributeError if the task has no terrain."""
 
@@ -109,6 +154,7 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
     "num_dof": lambda task: task.robot.num_dof,
     "num_dofs": lambda task: task.robot.num_dof,
     "dof_names": lambda task: list(task.robot.joint_names),
+    "num_actuated_dof": lambda task: task.num_actions,
     "num_bodies": lambda task: task.physics.model.nbody - 1,
     "feet_num": lambda task: len(task.feet_indices),
     "feet_names": lambda task: list(task.robot.feet_names),
@@ -129,8 +175,12 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
     "d_gains": lambda task: task.control.damping,
     "torque_limits": lambda task: task.control.torque_limits,
     "penalised_contact_indices": lambda task: task.penalised_indices,
+    "penalized_contact_indices": lambda task: task.penalised_indices,
     "termination_contact_indices": lambda task: task.termination_indices,
     "contact_filt": lambda task: task.contacts.in_contact,
+    "base_position": lambda task: task.base_pos,
+    "raw_default_dof_pos": lambda task: task.default_dof_pos,
+    "default_joint_pd_target": lambda task: task.default_dof_pos,
     "foot_positions": lambda task: task.feet_pos,
     "foot_velocities": lambda task: task.feet_vel,
     "friction_coeffs": _friction,
@@ -146,7 +196,23 @@ COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
         lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2),
         "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)",
     ),
-    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "it follows from self.base_quat"),
+    "rpy": (_rpy, "it follows from self.base_quat"),
+    "base_euler_xyz": (_rpy, "it follows from self.base_quat"),
+    "base_height": (
+        lambda task: task.base_pos[:, 2] - task.measured_heights.mean(dim=1),
+        "it follows from self.base_pos and self.measured_heights",
+    ),
+    "base_lin_acc": (
+        lambda task: (task.physics.robot_state.base_lin_vel_w - task.last_root_vel[:, :3]) / task.dt,
+        "it follows from self.root_states and self.last_root_vel",
+    ),
+    "dof_acc": (
+        lambda task: (task.dof_vel - task.last_dof_vel) / task.dt,
+        "it follows from self.dof_vel and self.last_dof_vel",
+    ),
+    "foot_heights": (_foot_heights, "it follows from self.feet_pos and the ground"),
+    "feet_roll": (_feet_angle(0), "it follows from self.physics.quantity('xquat')"),
+    "feet_yaw": (_feet_angle(2), "it follows from self.physics.quantity('xquat')"),
     "feet_air_time": (
         lambda task: torch.where(task.contacts.first_contact, task.contacts.last_air_time, task.contacts.air_time),
         "self.contacts counts it; write the reward as (self.contacts.last_air_time - 0.5) * self.contacts.first_contact",
@@ -173,7 +239,12 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_contacts": lambda task: task.contact_forces[:, task.feet_indices, 2] > task.contacts.force,
     "last_torques": lambda task: task.torques,
     "last_dof_pos": lambda task: task.dof_pos,
+    "last_feet_pos": lambda task: task.feet_pos,
+    "prev_foot_velocities": lambda task: task.feet_vel,
+    "last_contact_forces": lambda task: task.contact_forces,
     "last_last_actions": lambda task: task.last_actions,
+    "last_joint_pos_target": _joint_pos_target,
+    "last_last_joint_pos_target": lambda task: task.last_joint_pos_target,
 }
 """Name in legged_gym -> function. If a term reads the name, each step stores the function's value for the next step."""
 
@@ -188,6 +259,11 @@ _BODIES = (
     " QUANTITIES = ('xpos', 'xquat', 'cvel') makes them readable by self.physics.quantity(name)"
 )
 _ANGLES = "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]"
+_SUBSTEPS = (
+    "self.torques and self.dof_vel are those of the last physics step; for others, override apply_control(), which runs"
+    " before each physics step: call super().apply_control(), and write into a tensor of your own in place"
+)
+_OWN = "allocate your own tensors in _init_buffers(), and write them in place in advance()"
 _HISTORY = "observations.groups.<group>.history in the YAML is the number of steps that a group holds"
 _PICTURES = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 
@@ -220,7 +296,11 @@ ABSENT = {
     "roll": _ANGLES,
     "pitch": _ANGLES,
     "yaw": _ANGLES,
-    "base_euler_xyz": _ANGLES,
+    "foot_indices": f"self.feet_indices are indices of shapes; for the phases of a gait, {_OWN}",
+    "substep_torques": _SUBSTEPS,
+    "substep_dof_vel": _SUBSTEPS,
+    "substep_exceed_dof_pos_limits": _SUBSTEPS,
+    "substep_exceed_dof_pos_limit_abs": _SUBSTEPS,
     "first_contact": "self.contacts.first_contact (N, F) is True for the feet that touch down at this step",
     "obs_history": _HISTORY,
     "obs_history_buf": _HISTORY,
@@ -250,7 +330,11 @@ class LeggedGymNames:
     `root_states` (N, 13) has position [m], orientation (x, y, z, w), linear [m/s] and angular velocity [rad/s], all in the
     world frame, as in Isaac Gym. (In `base_quat` w is first; `base_lin_vel` and `base_ang_vel` are in the base frame.)
     `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
-    continue or end at this step [s]. `rpy` (N, 3) has roll, pitch and yaw [rad]. `friction_coeffs` is (N, 1, 1),
+    continue or end at this step [s]. `rpy` and `base_euler_xyz` (N, 3) have roll, pitch and yaw in [-pi, pi] [rad].
+    `base_height` (N,) is the base's height above the mean of the scanned ground [m]. `base_lin_acc` (N, 3) in the world frame
+    [m/s^2] and `dof_acc` (N, D) [rad/s^2] are changes over the control step, divided by its length. `foot_heights` (N, F) are
+    heights of soles above the ground under the feet's centres, clipped to [0, 1] m; a sole is as far below the centre as in
+    the default pose. `feet_roll` and `feet_yaw` (N, F) are angles of the feet's bodies [rad]. `friction_coeffs` is (N, 1, 1),
     `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3). `noise_scale_vec` has a number for
     each column of the actor's observations. All other names have the shapes and units of their counterparts in this package.
     """
@@ -267,10 +351,24 @@ class LeggedGymNames:
                     return self._by_their_name(name)
                 except AttributeError as error:
                     raise AttributeError(f"self.{name}: {error}") from None
-            known = [] if name.startswith("_") else [*NAMES, *vars(self)]
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.75)
-            hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'{hint}")
+            near = None if name.startswith("_") else self._nearest(name)
+            hint = f"did you mean '{near}'?" if near else _OWN
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'; {hint}")
+
+    def _nearest(self, name: str) -> str | None:
+        """Return the readable attribute that `name` may be a misspelling of: it has as many words, each of them similar,
+        with the same first letter.
+        """
+
+        def alike(one: str, other: str) -> bool:
+            return one[:1] == other[:1] and difflib.SequenceMatcher(None, one, other).ratio() > 0.6
+
+        words = name.split("_")
+        known = {*vars(self), *PLAIN, *COMPUTED, *CONSTANT, *KEPT}
+        public = [other for other in sorted(known) if other[:1] != "_" and other.count("_") == len(words) - 1]
+        likely = [other for other in public if all(map(alike, words, other.split("_")))]
+        near = difflib.get_close_matches(name, likely, n=len(likely) or 1, cutoff=0.75)
+        return next((other for other in near if other in KEPT or hasattr(self, other)), None)
 
     def _by_their_name(self, name: str) -> Any:
         """Return the value of legged_gym's attribute `name`.
@@ -284,10 +382,7 @@ class LeggedGymNames:
             compute, instead = COMPUTED[name]
             return ReadOnly.of(compute(self), f"self.{name} is computed when it is read, and cannot be written: {instead}")
         if name in CONSTANT:
-            made = vars(self).setdefault("_legged_gym", {})
-            if name not in made:
-                made[name] = CONSTANT[name](self)
-            return made[name]
+            return _once(self, name, CONSTANT[name])
         if name in KEPT:
             graph = vars(self).get("_graph")
             if graph is not None and graph.captured:
@@ -302,8 +397,10 @@ class LeggedGymNames:
 
     def remember(self) -> None:
         """Store values of names in `KEPT` that a term has read, before BaseTask's `remember` overwrites `last_actions`."""
-        for name in vars(self).get("_kept_names", ()):
+        kept = list(vars(self).get("_kept_names", ()))
+        older = [name for name in kept if name.startswith("last_last_")]
+        for name in sorted(kept, key=lambda name: name not in older):  # they read values that the others overwrite
             vars(self)[name].copy_(KEPT[name](self))
-            if name == "last_last_actions":  # a new episode must not see actions of the old one
-                masked_set_(vars(self)[name], self.reset_buf, 0.0)
         super().remember()  # type: ignore[misc]
+        for name in older:  # a new episode must not see values of the old one
+            masked_set_(vars(self)[name], self.reset_buf, KEPT[name](self))

@@ -2,11 +2,13 @@
 state.
 """
 
+import re
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from traceback import extract_tb
 from typing import Any
 
 import torch
@@ -44,7 +46,15 @@ def calling(term: str) -> Iterator[None]:
         raise
     except Exception as error:
         text = str(error).splitlines()
-        raise TermError(f"{term}: {text[0] if text else type(error).__name__}") from error
+        raise TermError(f"{term}: {text[0] if text else type(error).__name__}{_hint(error)}") from error
+
+
+def _hint(error: Exception) -> str:
+    """Return the end of the message about an error that legged_gym's forks cause by their shape of `last_actions`."""
+    third = re.compile(r"\blast_actions\[[^],]*,[^],]*,")
+    if isinstance(error, IndexError) and any(third.search(frame.line or "") for frame in extract_tb(error.__traceback__)):
+        return "; write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for last_actions[:, :, 1]"
+    return ""
 
 
 class ForbidHostReads:

@@ -73,3 +73,11 @@ class HeightScan:
         found = self._map[cells]
         self.heights.copy_(found[:, :-1])
         self.ground.copy_(found[:, -1])
+
+    def ground_at(self, points: Tensor) -> Tensor:
+        """Return the heights of the ground at `points` (N, K, 2), x and y in the world frame: (N, K) [m]."""
+        if self._on_plane:
+            return torch.zeros_like(points[..., 0])
+        row, column = ((points - self._origin) / self._cell).nan_to_num().unbind(dim=-1)
+        rows, columns = row.clamp(0.0, self._last[0]).floor(), column.clamp(0.0, self._last[1]).floor()
+        return self._map[(rows * self._columns + columns).int()]

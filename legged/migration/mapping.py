@@ -336,7 +336,7 @@ def _rest(result: Translation) -> None:
         plain = not found.why_unknown and all(isinstance(item, bool | int | float | str) for item in items)
         if path.startswith("rewards.") and plain and not reason:
             name = path.removeprefix("rewards.").replace(".", "_")
-            result.put(f"custom.{name}", found.value, path, f"read it as self.cfg.custom['{name}'], not as self.cfg.{path}")
+            result.put(f"custom.{name}", found.value, path, f"read it as self.cfg.rewards.{name}")
         elif re.match(tables.MINOR, path):
             result.minor.append(path)
         else:

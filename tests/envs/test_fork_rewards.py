@@ -1,12 +1,16 @@
 """Rewards of legged_gym's forks, run as they stand, and what the guard says of those that no graph could hold."""
 
+import copy
+import pickle
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import JOINTS, small_config
 from torch import Tensor
 
 from legged.envs import LeggedRobot
-from legged.errors import TermError
+from legged.errors import ConfigError, TermError
 from legged.math import get_euler_xyz, quat_rotate, quat_rotate_inverse, wrap_to_pi
 
 ROBOTS = 4
@@ -226,6 +230,44 @@ def test_what_is_no_reward_is_named(value):
         task(small_config())
 
 
+# ---- numbers under `rewards` of a fork -----------------------------------------------------------------------------------
+
+
+def test_own_numbers_of_rewards_are_those_of_custom():
+    class Mine(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            assert self.cfg.rewards.tracking_sigma == 0.25  # a setting of the same name comes first
+            return self.rew_buf * 0.0 + self.cfg.rewards.cycle_time
+
+    cfg = small_config(("custom", {"cycle_time": 0.64, "tracking_sigma": 7.0}))
+    task = Mine(cfg)
+    task.step(torch.zeros(ROBOTS, JOINTS))
+    row = task.rewards.last[task.rewards.names.index("lin_vel_z")]
+    assert row.tolist() == pytest.approx([0.64 * cfg.rewards.scales["lin_vel_z"] * task.dt] * ROBOTS)
+
+
+def test_own_numbers_are_those_of_their_own_configuration():
+    one = small_config(("custom", {"cycle_time": 0.64}))
+    for two in (replace(one, custom={"cycle_time": 0.8}), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
+        two.custom["cycle_time"] = 0.8
+        assert (one.rewards.cycle_time, two.rewards.cycle_time) == (0.64, 0.8)
+        assert two.rewards == one.rewards
+
+
+def test_a_number_that_is_nowhere_is_named_with_its_nearest():
+    rewards = small_config(("custom.cycle_time", 0.64)).rewards
+    with pytest.raises(AttributeError, match=r"command line: custom has no 'cycle_tim', .*did you mean 'cycle_time'\?"):
+        rewards.cycle_tim  # noqa: B018
+    with pytest.raises(AttributeError, match=r"custom has no 'tracking_sigm', .*did you mean 'tracking_sigma'\?"):
+        rewards.tracking_sigm  # noqa: B018
+    assert not hasattr(rewards, "__nothing__")
+
+
+def test_a_misspelled_setting_of_rewards_is_refused_whatever_custom_has():
+    with pytest.raises(ConfigError, match=r"rewards\.cycle_time"):
+        small_config(("custom", {"cycle_time": 0.64}), ("rewards.cycle_time", 0.8))
+
+
 # ---- what a graph would refuse, in rewards -------------------------------------------------------------------------------
 
 
@@ -264,6 +306,10 @@ REFUSED = {
     "a tensor bound anew": (rebind, "self.last_contact_force"),
     "contacts bound anew": (rebind_contacts, "self.last_contacts"),
     "air time counted": (lambda task: task.feet_air_time.__iadd__(task.dt).sum(dim=1), "self.contacts counts it"),
+    "actions in a third axis": (
+        lambda task: task.last_actions[:, :, 0].sum(dim=1),
+        "write self.last_actions for last_actions",
+    ),
     "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
 }
 

@@ -3,15 +3,17 @@
 import math
 import re
 
+import mujoco
 import pytest
 import torch
-from helpers import JOINTS, small_config, small_task, zero_actions
+from helpers import CALM, ENGINE, JOINTS, small_config, small_task, zero_actions
 from torch import Tensor
 
 from legged.envs import LeggedRobot
 from legged.envs.legged_gym_names import ABSENT, COMPUTED, CONSTANT, KEPT, PLAIN, ReadOnly
 from legged.errors import ConfigError
-from legged.math import get_euler_xyz, quat_rotate, quat_rotate_inverse
+from legged.math import get_euler_xyz, quat_apply_yaw, quat_from_angle_axis, quat_rotate, quat_rotate_inverse
+from legged.registry import make_task, task_config
 
 ROBOTS = 4
 
@@ -74,6 +76,115 @@ def test_names_mean_what_they_mean_there(task):
     assert task.height_points[2, :, :2].equal(task.height_scan.points)
     torch.testing.assert_close(quat_rotate_inverse(task.base_quat, task.gravity_vec), task.projected_gravity)
     assert task.command_ranges["lin_vel_x"].tolist() == task.command_sampler.ranges[0].tolist()
+    assert task.base_position is task.base_pos
+    assert task.penalized_contact_indices is task.penalised_indices
+    assert task.raw_default_dof_pos is task.default_joint_pd_target is task.default_dof_pos
+    assert task.num_actuated_dof == JOINTS
+    assert task.base_euler_xyz.equal(task.rpy)
+    assert task.base_height.equal(task.base_pos[:, 2])  # the ground is a plane
+
+
+def test_heights_of_feet_are_those_of_their_soles():
+    """The robot in its default pose, lifted by 0.1 m, on ground of 0.3 m height; ANYmal's feet are balls."""
+    ground = [("terrain.mesh_type", "height_map"), ("terrain.proportions", {"flat": 1.0})]
+    task = small_task(*ground, ("terrain.num_rows", 1), ("terrain.num_cols", 1), ("terrain.max_init_terrain_level", 0))
+    task.height_scan._map.fill_(0.3)
+    qpos = torch.tensor(task.robot.default_qpos, dtype=torch.float32).repeat(ROBOTS, 1)
+    qpos[:, 2] = 0.3 + task.robot.height + 0.1
+    task.physics.write(torch.ones(ROBOTS, dtype=torch.bool), qpos, torch.zeros_like(task.reset_qvel))
+    task.sense()
+    torch.testing.assert_close(task.foot_heights, torch.full((ROBOTS, 4), 0.1), rtol=0.0, atol=2e-3)
+    (radius,) = {float(task.physics.model.geom(foot[0]).size[0]) for foot in task.robot.feet_shapes}
+    torch.testing.assert_close(task.foot_heights, task.feet_pos[:, :, 2] - radius - 0.3)
+    task.height_scan._map.fill_(0.5)  # feet below the ground, and 1.2 m above it
+    assert task.foot_heights.unique().tolist() == [0.0]
+    task.height_scan._map.fill_(-0.9)
+    assert task.foot_heights.unique().tolist() == [1.0]
+
+
+def test_soles_of_boxes_or_several_shapes_are_the_lowest_points():
+    config = task_config("g1_flat", [("env.num_envs", 2), *ENGINE, *CALM], on_cpu=True)
+    task = make_task(config)
+    qpos = torch.tensor(task.robot.default_qpos, dtype=torch.float32).repeat(2, 1)
+    qpos[:, 2] = task.robot.height + 0.25
+    task.physics.write(torch.ones(2, dtype=torch.bool), qpos, torch.zeros_like(task.reset_qvel))
+    task.sense()
+    torch.testing.assert_close(task.foot_heights, torch.full((2, 2), 0.25), rtol=0.0, atol=2e-3)
+
+
+def test_ground_under_a_point_is_that_of_the_height_scan():
+    ground = [("terrain.mesh_type", "height_map"), ("terrain.proportions", {"random_grid": 1.0}), ("terrain.num_rows", 3)]
+    rough = small_task(*ground, ("terrain.num_cols", 1), ("terrain.max_init_terrain_level", 2), ("init_state.yaw", [0, 0]))
+    points = rough.base_pos[:, None, :2] + rough.height_scan.points
+    torch.testing.assert_close(rough.height_scan.ground_at(points), rough.measured_heights)
+    assert len(rough.measured_heights.unique()) > 5
+
+
+def test_angles_of_feet_are_those_of_their_bodies():
+    """Roll and yaw of the rotation matrices that C MuJoCo computes for the same positions."""
+    turning = type("Turning", (LeggedRobot,), {"QUANTITIES": ("xquat",)})(small_config())
+    torch.manual_seed(5)
+    for _ in range(5):
+        turning.step(torch.randn(ROBOTS, JOINTS))
+    data = mujoco.MjData(turning.physics.model)
+    for i in range(ROBOTS):
+        data.qpos[:] = turning.physics.qpos[i].double().numpy()
+        mujoco.mj_kinematics(turning.physics.model, data)
+        for k, (shape, *_) in enumerate(turning.robot.feet_shapes):
+            rotation = data.xmat[turning.physics.model.geom(shape).bodyid[0]].reshape(3, 3)
+            assert float(turning.feet_roll[i, k]) == pytest.approx(math.atan2(rotation[2, 1], rotation[2, 2]), abs=1e-4)
+            assert float(turning.feet_yaw[i, k]) == pytest.approx(math.atan2(rotation[1, 0], rotation[0, 0]), abs=1e-4)
+
+
+def test_angles_of_feet_say_what_they_need(task):
+    with pytest.raises(AttributeError, match=r"self\.feet_yaw: needs .*; write QUANTITIES = \('xquat',\) in the class"):
+        task.feet_yaw  # noqa: B018
+
+
+def test_accelerations_and_the_values_of_the_step_before():
+    """Differences of what a step and the step before it left, while no episode ends."""
+    names = ("dof_acc", "base_lin_acc", "last_feet_pos", "prev_foot_velocities", "last_contact_forces")
+    targets = ("last_joint_pos_target", "last_last_joint_pos_target")
+
+    class Fork(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            self.seen = [getattr(self, name).clone() for name in (*names, *targets)]
+            return self.rew_buf * 0.0
+
+    fork = Fork(small_config(), graph=False)
+    fork.reset()
+    torch.manual_seed(0)
+    history = []
+    for _ in range(6):
+        fork.step(0.1 * torch.randn(ROBOTS, JOINTS))
+        assert not fork.reset_buf.any()
+        velocity = fork.physics.qvel[:, :3]  # of the base, in the world frame
+        now = (fork.dof_vel, velocity, fork.feet_pos, fork.feet_vel, fork.contact_forces, fork.joint_pos_target)
+        history.append([tensor.clone() for tensor in now])
+        if len(history) > 2:
+            older, before, now = history[-3:]
+            expected = [(now[0] - before[0]) / 0.02, (now[1] - before[1]) / 0.02, *before[2:], older[5]]
+            for name, seen, right in zip((*names, *targets), fork.seen, expected, strict=True):
+                torch.testing.assert_close(seen, right, rtol=1e-4, atol=1e-3, msg=name)
+    assert fork.contact_forces.abs().max() > 1.0
+
+
+@pytest.mark.parametrize(("axis", "angle"), [(0, 0.7), (1, -0.4), (2, 3.0)])
+def test_a_quaternion_of_an_angle_about_an_axis_has_w_first(axis, angle):
+    direction = [0.0, 0.0, 0.0]
+    direction[axis] = 2.5  # of any length
+    found = quat_from_angle_axis(torch.tensor([angle, 0.0]), torch.tensor(direction))
+    torch.testing.assert_close(found, torch.tensor([quat_about(axis, angle), [1.0, 0.0, 0.0, 0.0]]))
+
+
+def test_a_turn_by_the_yaw_ignores_roll_and_pitch():
+    """A quaternion that tilts about a horizontal axis and then turns by 0.7 about z turns a vector by 0.7 about z."""
+    turn, tilt, vector = 0.7, 0.9, torch.tensor([[1.0, 2.0, 3.0]])
+    (w, _, _, z), x = quat_about(2, turn), math.sin(tilt / 2)
+    tilted = [w * math.cos(tilt / 2), w * x, z * x, z * math.cos(tilt / 2)]
+    expected = [math.cos(turn) - 2 * math.sin(turn), math.sin(turn) + 2 * math.cos(turn), 3.0]
+    torch.testing.assert_close(quat_apply_yaw(torch.tensor([tilted]), vector), torch.tensor([expected]))
+    torch.testing.assert_close(quat_apply_yaw(torch.tensor([quat_about(0, 0.4)]), vector), vector)
 
 
 def test_targets_of_joints_that_are_held_are_their_default_angles():
@@ -138,6 +249,30 @@ def test_a_slip_of_the_pen_has_its_nearest_name(task):
     with pytest.raises(AttributeError, match="the ground is a plane"):
         task.terrain_levels  # noqa: B018
     assert not hasattr(task, "nothing_like_it")
+
+
+@pytest.mark.parametrize(
+    ("slip", "near"),
+    [
+        ("feet_velo", "feet_vel"),
+        ("torque", "torques"),
+        ("terrain_level", None),  # there are no levels on a plane
+        ("reset_yaw", None),  # _reset_yaw is private
+        ("front_hip_indices", None),  # hip_indices is not there
+        ("hip_indice", None),
+        ("last_foot_vel", None),  # last_dof_vel is something else
+        ("ref_dof_pos", None),  # and so is dof_pos
+        ("edge_reset_buf", None),
+    ],
+)
+def test_only_what_can_be_read_and_is_like_it_is_proposed(task, slip, near):
+    with pytest.raises(AttributeError) as error:
+        getattr(task, slip)
+    proposed = re.search("did you mean '(.*)'", str(error.value))
+    assert (proposed and proposed[1]) == near
+    assert near or str(error.value).endswith(
+        "allocate your own tensors in _init_buffers(), and write them in place in advance()"
+    )
 
 
 class Mistaken(LeggedRobot):
