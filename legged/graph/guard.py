@@ -49,12 +49,20 @@ def calling(term: str) -> Iterator[None]:
         raise TermError(f"{term}: {text[0] if text else type(error).__name__}{_hint(error)}") from error
 
 
+HINTS = {
+    r"\blast_actions\[[^],]*,[^],]*,": "write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for"
+    " last_actions[:, :, 1]",
+    r"\bdefault_dof_pos\[:,": "self.default_dof_pos is (D,); write self.default_dof_pos[indices]",
+    r"\bcfg\[": "write self.cfg.rewards.name for self.cfg['rewards']['name']",
+}
+"""Pattern of an expression in legged_gym's forks that fails here -> what to write instead."""
+
+
 def _hint(error: Exception) -> str:
-    """Return the end of the message about an error that legged_gym's forks cause by their shape of `last_actions`."""
-    third = re.compile(r"\blast_actions\[[^],]*,[^],]*,")
-    if isinstance(error, IndexError) and any(third.search(frame.line or "") for frame in extract_tb(error.__traceback__)):
-        return "; write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for last_actions[:, :, 1]"
-    return ""
+    """Return the end of the message of a TypeError or IndexError whose line matches a pattern of HINTS, else nothing."""
+    lines = " ".join(frame.line or "" for frame in extract_tb(error.__traceback__))
+    hints = [hint for pattern, hint in HINTS.items() if re.search(pattern, lines)]
+    return f"; {hints[0]}" if hints and isinstance(error, IndexError | TypeError) else ""
 
 
 class ForbidHostReads:

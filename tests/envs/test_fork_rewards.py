@@ -310,6 +310,11 @@ REFUSED = {
         lambda task: task.last_actions[:, :, 0].sum(dim=1),
         "write self.last_actions for last_actions",
     ),
+    "default angles by robot": (
+        lambda task: task.default_dof_pos[:, [0, 3]].sum(dim=1),
+        r"write self.default_dof_pos\[indices",
+    ),
+    "a dictionary of settings": (lambda task: task.rew_buf * task.cfg["rewards"]["sigma"], "write self.cfg.rewards.name for"),
     "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
 }
 
