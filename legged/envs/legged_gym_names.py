@@ -250,10 +250,7 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
 
 _COUNT = "count in your own tensor: allocate it in _init_buffers(), and let the hook advance() increment it in place"
 _GYM = "there is no Isaac Gym: self.physics makes the steps; to change a step, override the hooks that _step() calls"
-_INDICES = (
-    "compute your own indices in _init_buffers(), such as"
-    " torch.tensor([i for i, name in enumerate(self.dof_names) if 'hip' in name], device=self.device)"
-)
+_INDICES = "self.joints('hip') has the indices of the joints whose names contain 'hip'; other patterns work alike"
 _BODIES = (
     "self.feet_pos and self.feet_vel (N, F, 3) hold the states of the feet; for all bodies, the class attribute"
     " QUANTITIES = ('xpos', 'xquat', 'cvel') makes them readable by self.physics.quantity(name)"
