@@ -30,6 +30,7 @@ from legged.config.mdp import (
     TerminationsConfig,
 )
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.section import Section
 from legged.config.sensors import HeightLimitsConfig, HeightMapConfig
 from legged.config.task import TaskConfig
 
@@ -46,7 +47,7 @@ Law = Literal["P", "V", "T"]
 
 
 @dataclass(frozen=True)
-class TerrainConfig:
+class TerrainConfig(Section):
     """Terrain: a plane, or tiles of several types in rows of rising difficulty."""
 
     mesh_type: Literal["plane", "height_map"] = "plane"
@@ -121,7 +122,7 @@ class CommandCurriculumConfig:
 
 
 @dataclass(frozen=True)
-class CommandsConfig:
+class CommandsConfig(Section):
     """Velocity commands: ranges, heading mode, curriculum."""
 
     ranges: CommandRanges = CommandRanges()
@@ -141,7 +142,7 @@ class CommandsConfig:
 
 
 @dataclass(frozen=True)
-class InitStateConfig:
+class InitStateConfig(Section):
     """State after a reset. The robot's files set the default joint angles and the spawn height."""
 
     dof_pos_factor: Range = field(default=(0.5, 1.5), metadata=MOTION)

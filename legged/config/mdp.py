@@ -1,17 +1,16 @@
 """Sections of every task's Markov decision process: control, observations, rewards, terminations, randomisation."""
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
 from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry, rescaled_by_term
-from legged.config.origins import Origins
 from legged.config.randomization import DrawConfig, Range
-from legged.errors import suggest
+from legged.config.section import Section
 
 
 @dataclass(frozen=True)
-class ControlConfig:
+class ControlConfig(Section):
     """Conversion of actions to controls of the robot."""
 
     decimation: int = field(default=4, metadata=between(1, 1000))
@@ -21,7 +20,7 @@ class ControlConfig:
 
 
 @dataclass(frozen=True)
-class TerminationsConfig:
+class TerminationsConfig(Section):
     """Terms `_terminate_<name>` that end an episode. NaN, infinite numbers and the time limit also end it."""
 
     failures: tuple[str, ...] = field(default=(), metadata=TERMS)
@@ -31,7 +30,7 @@ class TerminationsConfig:
 
 
 @dataclass(frozen=True)
-class DomainRandConfig:
+class DomainRandConfig(Section):
     """Domain randomisation of the robots."""
 
     ranges: dict[str, Range | DrawConfig] = field(
@@ -52,7 +51,7 @@ class DomainRandConfig:
 
 
 @dataclass(frozen=True)
-class RewardsConfig:
+class RewardsConfig(Section):
     """Scales of the `_reward_<name>` terms."""
 
     scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
@@ -61,18 +60,6 @@ class RewardsConfig:
     """Multiply scales by the control step, so that sums of rewards over time do not depend on the control step."""
     only_positive_rewards: bool = False
     """Clip the sum of rewards (except `termination`) at zero, so that a robot can't avoid negative rewards by falling."""
-
-    if not TYPE_CHECKING:  # type checkers do not see __getattr__, so they still report misspelled settings
-
-        def __getattr__(self, name: str) -> Any:
-            """Return the number `custom.<name>`, as rewards of legged_gym read `self.cfg.rewards.<name>`."""
-            if name.startswith("_"):
-                raise AttributeError(name)
-            custom, origins = vars(self).get("_custom", ({}, Origins()))
-            if name in custom:
-                return custom[name]
-            near = suggest(name, [f.name for f in fields(self)] + list(custom), "settings")
-            raise AttributeError(f"{origins.where('custom')} has no '{name}', and neither has rewards{near}")
 
 
 @dataclass(frozen=True)
@@ -88,7 +75,7 @@ class ObservationGroupConfig:
 
 
 @dataclass(frozen=True)
-class ObservationsConfig:
+class ObservationsConfig(Section):
     """Observation groups, and scales and errors of their terms."""
 
     groups: dict[str, ObservationGroupConfig] = field(default_factory=dict)

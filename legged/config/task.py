@@ -1,17 +1,18 @@
 """Configuration of any kind of task. If a task class has more sections, its `Config` is a subclass of TaskConfig."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 from legged.config.bounds import NAME
 from legged.config.learning import TrainConfig
 from legged.config.mdp import ControlConfig, DomainRandConfig, ObservationsConfig, RewardsConfig, TerminationsConfig
 from legged.config.origins import Origins
+from legged.config.section import Section
 from legged.config.world import EnvConfig, SimConfig
 
 
 @dataclass(frozen=True)
-class TaskConfig:
+class TaskConfig(Section):
     """Configuration of a task: its world, its Markov decision process, and the training of its policy."""
 
     task: str = field(default="", metadata=NAME)
@@ -38,9 +39,10 @@ class TaskConfig:
     """Sources of the settings. `compare=False` marks that this field is not a setting, so files neither set nor store it."""
 
     def __post_init__(self) -> None:
-        rewards = replace(self.rewards)  # another configuration may hold the same section
-        object.__setattr__(rewards, "_custom", (self.custom, self.origins))
-        object.__setattr__(self, "rewards", rewards)
+        for name in (f.name for f in fields(self) if isinstance(getattr(self, f.name), Section)):
+            section = replace(getattr(self, name))  # another configuration may hold the same section
+            object.__setattr__(section, "_custom", (self.custom, name, self.origins))
+            object.__setattr__(self, name, section)
 
     def trained(self) -> Self:
         """Return the configuration for play and evaluation of a trained policy. Domain randomisation is off, and the settings

@@ -4,12 +4,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from legged.config.bounds import LONGEST_S, between, positive, quantity
+from legged.config.section import Section
 
 NewtonSolver = Literal["mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit"]
 
 
 @dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(Section):
     """Number of robots, length of episodes, and seed."""
 
     num_envs: int = field(default=4096, metadata=between(1, 2**20))
@@ -22,7 +23,7 @@ class EnvConfig:
 
 
 @dataclass(frozen=True)
-class SimConfig:
+class SimConfig(Section):
     """Physics time step, engine and contact solver."""
 
     physics: Literal["auto", "mujoco_warp", "mujoco", "newton"] = "auto"

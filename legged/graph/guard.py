@@ -53,7 +53,6 @@ HINTS = {
     r"\blast_actions\[[^],]*,[^],]*,": "write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for"
     " last_actions[:, :, 1]",
     r"\bdefault_dof_pos\[:,": "self.default_dof_pos is (D,); write self.default_dof_pos[indices]",
-    r"\bcfg\[": "write self.cfg.rewards.name for self.cfg['rewards']['name']",
 }
 """Pattern of an expression in legged_gym's forks that fails here -> what to write instead."""
 
@@ -348,8 +347,14 @@ class _Operators(TorchDispatchMode):
         return ""
 
 
+def _is_mask(index: Any) -> bool:
+    return isinstance(index, Tensor) and index.dtype is torch.bool
+
+
 class _Calls(TorchFunctionMode):
-    """Function mode that sees Python's calls of torch, and replaces numbers of the host by cached constants."""
+    """Function mode that sees Python's calls of torch, and replaces numbers of the host by cached constants. For
+    `x[mask] = number` it calls `masked_fill_`, which a graph can hold.
+    """
 
     REASONS = {
         Tensor.cpu: "copies to the host (.cpu())",
@@ -369,6 +374,10 @@ class _Calls(TorchFunctionMode):
         kwargs, guard = kwargs or {}, self._guard
         if func is Tensor.__getitem__:
             args = guard.constants.pick(*args)
+        if func is Tensor.__setitem__ and _is_mask(args[1]) and not (isinstance(args[2], Tensor) and args[2].dim()):
+            rows = args[1].view(*args[1].shape, *[1] * (args[0].dim() - args[1].dim()))
+            args[0].masked_fill_(rows, args[2])
+            return None
         if func in (Tensor.__getitem__, Tensor.__setitem__):
             return func(args[0], guard.constants.index(args[0], args[1]), *args[2:])
         if func in self.REASONS:

@@ -246,6 +246,30 @@ def test_own_numbers_of_rewards_are_those_of_custom():
     assert row.tolist() == pytest.approx([0.64 * cfg.rewards.scales["lin_vel_z"] * task.dt] * ROBOTS)
 
 
+def test_own_numbers_of_other_sections_and_in_brackets_are_found_too():
+    cfg = small_config(("custom", {"selected": "hurdle"}))
+    assert cfg.terrain.selected == cfg.commands.selected == cfg["env"]["selected"] == "hurdle"
+    assert cfg["rewards"]["tracking_sigma"] == cfg.rewards.tracking_sigma
+    with pytest.raises(AttributeError, match=r"custom has no 'selecte', and neither has terrain; did you mean 'selected'\?"):
+        cfg.terrain.selecte  # noqa: B018
+
+
+def test_a_number_is_written_where_a_mask_is_true():
+    class Mine(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            reward, each = torch.ones_like(self.base_pos[:, 0]), torch.ones_like(self.dof_pos)
+            reward[self.episode_length_buf % 2 == 1] = 0.25
+            each[self.dof_pos > 100.0] = 7.0
+            each[self.episode_length_buf < 0] = reward.sum()
+            return reward * each.mean(dim=1)
+
+    cfg = small_config()
+    task = Mine(cfg)
+    task.step(torch.zeros(ROBOTS, JOINTS))
+    row = task.rewards.last[task.rewards.names.index("lin_vel_z")]
+    assert row.tolist() == pytest.approx([0.25 * cfg.rewards.scales["lin_vel_z"] * task.dt] * ROBOTS)
+
+
 def test_own_numbers_are_those_of_their_own_configuration():
     one = small_config(("custom", {"cycle_time": 0.64}))
     for two in (replace(one, custom={"cycle_time": 0.8}), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
@@ -314,7 +338,6 @@ REFUSED = {
         lambda task: task.default_dof_pos[:, [0, 3]].sum(dim=1),
         r"write self.default_dof_pos\[indices",
     ),
-    "a dictionary of settings": (lambda task: task.rew_buf * task.cfg["rewards"]["sigma"], "write self.cfg.rewards.name for"),
     "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
 }
 
