@@ -213,10 +213,6 @@ COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
     "foot_heights": (_foot_heights, "it follows from self.feet_pos and the ground"),
     "feet_roll": (_feet_angle(0), "it follows from self.physics.quantity('xquat')"),
     "feet_yaw": (_feet_angle(2), "it follows from self.physics.quantity('xquat')"),
-    "feet_air_time": (
-        lambda task: torch.where(task.contacts.first_contact, task.contacts.last_air_time, task.contacts.air_time),
-        "self.contacts counts it; write the reward as (self.contacts.last_air_time - 0.5) * self.contacts.first_contact",
-    ),
     "joint_pos_target": (_joint_pos_target, "self.control computes it from the actions"),
 }
 """Name in legged_gym -> function that computes the value at each reading, and a hint for users who try to write to it."""
@@ -235,6 +231,7 @@ CONSTANT: dict[str, Callable[[Any], Tensor]] = {
 """Name in legged_gym -> function that makes a constant at the first reading."""
 
 KEPT: dict[str, Callable[[Any], Tensor]] = {
+    "feet_air_time": lambda task: task.contacts.air_time,
     "last_root_vel": lambda task: _root_states(task)[:, 7:],
     "last_contacts": lambda task: task.contact_forces[:, task.feet_indices, 2] > task.contacts.force,
     "last_torques": lambda task: task.torques,
@@ -246,7 +243,9 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_joint_pos_target": _joint_pos_target,
     "last_last_joint_pos_target": lambda task: task.last_joint_pos_target,
 }
-"""Name in legged_gym -> function. If a term reads the name, each step stores the function's value for the next step."""
+"""Name in legged_gym -> function. If a term reads the name, each step stores the function's value for the next step. So a
+reward may count in `feet_air_time` or assign `last_contacts`, as legged_gym's do: the next step starts from the true values.
+"""
 
 _COUNT = "count in your own tensor: allocate it in _init_buffers(), and let the hook advance() increment it in place"
 _GYM = "there is no Isaac Gym: self.physics makes the steps; to change a step, override the hooks that _step() calls"
@@ -326,8 +325,8 @@ class LeggedGymNames:
 
     `root_states` (N, 13) has position [m], orientation (x, y, z, w), linear [m/s] and angular velocity [rad/s], all in the
     world frame, as in Isaac Gym. (In `base_quat` w is first; `base_lin_vel` and `base_ang_vel` are in the base frame.)
-    `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings that
-    continue or end at this step [s]. `rpy` and `base_euler_xyz` (N, 3) have roll, pitch and yaw in [-pi, pi] [rad].
+    `dof_state` (N * D, 2) has angles [rad] and velocities [rad/s]. `feet_air_time` (N, F) has the durations of swings up to
+    the previous step [s]. `rpy` and `base_euler_xyz` (N, 3) have roll, pitch and yaw in [-pi, pi] [rad].
     `base_height` (N,) is the base's height above the mean of the scanned ground [m]. `base_lin_acc` (N, 3) in the world frame
     [m/s^2] and `dof_acc` (N, D) [rad/s^2] are changes over the control step, divided by its length. `foot_heights` (N, F) are
     heights of soles above the ground under the feet's centres, clipped to [0, 1] m; a sole is as far below the centre as in
@@ -337,6 +336,12 @@ class LeggedGymNames:
     """
 
     reset_buf: Tensor
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in vars(self).get("_kept_names", ()):  # a graph goes on reading the tensor that it recorded
+            vars(self)[name].copy_(value)
+        else:
+            super().__setattr__(name, value)
 
     if not TYPE_CHECKING:  # type checkers do not see __getattr__, so they still report missing attributes
 

@@ -300,7 +300,6 @@ WRITES = {
     "a slice in place": lambda task: task.root_states[:, 7:9].uniform_(-1.0, 1.0),
     "a slice of a slice": lambda task: task.root_states[:, 7:10][:, 0].mul_(2.0),
     "out": lambda task: torch.add(task.base_pos, 1.0, out=task.root_states[:, :3]),
-    "counting air time": lambda task: task.feet_air_time.__iadd__(0.02),
     "joint angles": lambda task: task.dof_state.view(ROBOTS, JOINTS, 2)[..., 0].zero_(),
     "widening commands": lambda task: task.command_ranges["lin_vel_x"].__setitem__(1, 2.0),
 }
@@ -308,7 +307,7 @@ WRITES = {
 
 @pytest.mark.parametrize("name", WRITES)
 def test_writing_where_it_would_be_lost_is_an_error(task, name):
-    with pytest.raises(AttributeError, match=r"^self\.(root_states|feet_air_time|dof_state|command_ranges)"):
+    with pytest.raises(AttributeError, match=r"^self\.(root_states|dof_state|command_ranges)"):
         WRITES[name](task)
 
 
@@ -385,12 +384,6 @@ def test_actions_of_the_last_episode_are_not_those_before_the_first_ones():
     for seen in (0.3, 0.0, 0.0, 0.3):  # of the step that ends the episode, then of three of the next one
         fork.step(torch.full((ROBOTS, JOINTS), 0.3))
         assert fork.seen.unique().tolist() == pytest.approx([seen])
-
-
-def test_air_time_is_that_of_swings_which_go_on_or_end(task):
-    contacts = task.contacts
-    air = torch.where(contacts.first_contact, contacts.last_air_time, contacts.air_time)
-    assert task.feet_air_time.tolist() == air.tolist()
 
 
 @pytest.mark.parametrize(("axis", "angle"), [(0, 0.7), (1, -0.4), (2, 3.0), (2, -3.0)])
