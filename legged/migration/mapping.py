@@ -33,7 +33,7 @@ def map_settings(fork: Fork) -> Translation:
     if not result.settings.get("domain_rand.randomize_base_mass", False):
         result.settings.pop("domain_rand.added_mass_range", None)
     _terrain(result, fork)
-    _commands(result)
+    _commands(result, fork)
     _contacts(result)
     _rewards(result, fork)
     _observations(result, fork)
@@ -129,8 +129,17 @@ def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[di
     return rounded, out
 
 
-def _commands(result: Translation) -> None:
-    """Map the command curriculum. legged_gym widens the range of vx by 0.5 m/s at a time, up to max_curriculum."""
+def _commands(result: Translation, fork: Fork) -> None:
+    """Map the range of yaw rates in heading mode, where legged_gym clips to a number in its code, and the command curriculum.
+    legged_gym widens the range of vx by 0.5 m/s at a time, up to max_curriculum.
+    """
+    path = "commands.ranges.ang_vel_yaw"
+    if result.get("commands.heading_command") is True:
+        clips = (method.reads["yaw"] for methods in fork.methods.values() for method in methods if "yaw" in method.reads)
+        limit = float(next(clips, 1.0))
+        result.put(path, [-limit, limit], "")
+        if path in result.theirs and result.get(path) != [-limit, limit]:
+            result.lose(path, f"the fork does not use it in heading mode; the range here is its limit there, {limit:g} rad/s")
     limit = result.get("commands.max_curriculum", 0.0)
     speeds = result.get("commands.ranges.lin_vel_x", [])
     if result.get("commands.curriculum", False) is not True or len(speeds) != 2:
@@ -147,13 +156,14 @@ def _commands(result: Translation) -> None:
 
 
 def _contacts(result: Translation) -> None:
-    """Map self-collisions and friction. As in PhysX, the friction range is averaged with the ground's friction."""
-    own = result.get("domain_rand.friction_range", [])
-    ground = result.get("terrain.static_friction", 1.0)
-    if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
-        mean = [round(0.5 * (value + ground), 4) for value in own]
-        comment = f"PhysX averages the robot's {own[0]:g} to {own[1]:g} with the ground's {ground:g}"
-        result.put("domain_rand.friction_range", mean, "domain_rand.friction_range", comment)
+    """Map self-collisions, friction and restitution. PhysX averages the robot's ranges with the ground's values."""
+    for name, ours, of_ground, usual in tables.OF_CONTACTS:
+        path = f"domain_rand.{name}_range"
+        if path in result.theirs and result.get(f"domain_rand.randomize_{name}") is True:
+            pair, ground = result.get(path, []), result.get(f"terrain.{of_ground}", usual)
+            mean = [round(0.5 * (value + ground), 4) for value in pair]
+            told = " to ".join(f"{value:g}" for value in pair)
+            result.put(ours, mean, path, f"PhysX averages the robot's {told} with the ground's {ground:g}")
     path = "asset.self_collisions"
     if path in result.theirs and result.get(path, 1.0) == 0:
         if result.theirs[path].place.startswith("legged_gym's"):
@@ -222,6 +232,8 @@ def _observations(result: Translation, fork: Fork) -> None:
         if own:
             where = fork.methods["compute_observations"][0].place
             text += f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where})"
+    if any("normal" in method.reads for method in fork.methods.get("compute_observations", [])):
+        text += "; its noise is normal, here it is uniform: 1.73 times the fork's noise_level has the same variance"
     result.note("observations", text)
     if groups[0]:
         for group, terms in (("actor", groups[0]), ("critic", groups[1] or groups[0])):
