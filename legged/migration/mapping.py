@@ -16,8 +16,6 @@ from legged.migration.translation import DEFAULTS, Translation, is_number
 from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
 
-LONGEST_HISTORY = 20
-"""Longest observation history that `_by_number` tries [steps]."""
 SIGMA = "tracking_sigma"
 OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 """Methods of legged_gym that use commands[:, 3], the heading."""
@@ -258,17 +256,14 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
 
 
 def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
-    """Return legged_gym's terms and the number of steps that give `number` numbers in total; None and 1 if none fit."""
+    """Return legged_gym's terms and the number of steps, at most 20, that give `number` numbers; None and 1 if none fit."""
     joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if result.get("terrain.measure_heights", False):
         columns, rows = (result.get(path, []) for path in tables.OF_HEIGHTS)
         groups = {size + len(columns) * len(rows): [*terms, "heights"] for size, terms in groups.items()} | groups
-    for history in range(1, LONGEST_HISTORY + 1):
-        for size, terms in groups.items():
-            if number == history * size:
-                return terms, history
-    return None, 1
+    fits = ((groups[size], steps) for steps in range(1, 21) for size in groups if number == steps * size)
+    return next(fits, (None, 1))
 
 
 def _recurrent(result: Translation) -> None:
@@ -331,8 +326,7 @@ def _hooks(result: Translation, fork: Fork) -> None:
     hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:
         result.note("methods", f"move the fork's own methods by hand (docs/migrating.md): {', '.join(hooks)}")
-    fourth = [name for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING]
-    readers = [f"{name} ({own[name].place})" for name in fourth]
+    readers = [f"{name} ({m.place})" for name, m in own.items() if "fourth" in m.reads and name not in OF_HEADING]
     if readers:
         result.note("commands", f"commands[:, 3] is the heading here, and no column follows it; check {', '.join(readers)}")
 
