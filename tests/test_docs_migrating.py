@@ -13,6 +13,7 @@ from test_docs_tasks import fenced, named
 
 from legged import math as legged_math
 from legged import registry, user_modules
+from legged.cli.migrate import _task_name
 from legged.cli.train import train
 from legged.config.loader import to_dict
 from legged.config.schema import LeggedConfig
@@ -36,6 +37,11 @@ def column(text: str, index: int) -> set[str]:
     """Return what the rows of a text's tables have in backquotes in a column."""
     rows = [row.split("|") for row in text.splitlines() if row.startswith("|")]
     return {name for row in rows for name in re.findall(r"`([^`]+)`", row[index])}
+
+
+def test_the_first_commands_name_the_file_that_is_written():
+    """This package has a task go2, so that the new task is my_go2."""
+    assert f"--task go2 --robot robots/go2 --out tasks --run\nlegged train tasks/{_task_name('go2')}.yaml --show\n" in PAGE
 
 
 @pytest.fixture

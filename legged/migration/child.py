@@ -41,7 +41,12 @@ LONGEST = 100_000
 """Greatest length of a value or of an error's text, in characters."""
 OPERATORS = ["add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul", "and", "or", "xor", "lshift", "rshift"]
 INSTALLED = ("site-packages", "dist-packages", sysconfig.get_path("stdlib"), "<frozen")
-READS = {"tracking_sigma": r"\btracking_sigma\b", "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)"}
+READS = {
+    "tracking_sigma": r"\btracking_sigma\b",
+    "fourth": r"\bcommands\[:, (3|4|5|6|7|8|9)",
+    "normal": r"\brandn",
+    "yaw": r"wrap_to_pi\([^()]*\), -([\d.]+), \1\)",
+}
 """Name -> pattern that is searched for in the text of a method."""
 CUT = "(cut)"
 """Name of a stand-in for columns of a `torch.cat` result, if it is unknown which joined parts the columns come from."""
@@ -208,12 +213,12 @@ def objects() -> list[Any]:
     return [value for module in modules for value in list(module.values())]
 
 
-def fork_classes(attribute: str) -> list[type]:
-    """Return the user's classes that have an attribute whose name begins with `attribute`. A class is left out if another of
-    these classes is derived from it.
+def fork_classes(*attributes: str) -> list[type]:
+    """Return the user's classes that have an attribute whose name begins with one of `attributes`. A class is left out if
+    another of these classes is derived from it.
     """
     classes = dict.fromkeys(value for value in objects() if isinstance(value, type) and _is_of_fork(value.__module__))
-    having = [cls for cls in classes if any(name.startswith(attribute) for name in dir(cls))]
+    having = [cls for cls in classes if any(name.startswith(attributes) for name in dir(cls))]
     return [cls for cls in having if not any(other is not cls and issubclass(other, cls) for other in having)]
 
 
@@ -342,15 +347,15 @@ def settings(owner: Any, prefix: str = "", above: tuple[type, ...] = ()) -> dict
 
 
 def method(function: Any) -> dict[str, Any]:
-    """Return place and digest of a method, and the names of `READS` that it reads. Layout and docstring do not affect the
-    digest. `self.env.x`, as in a container of rewards, gives the same digest as `self.x`.
+    """Return place and digest of a method, and the names of `READS` that it reads, with the texts of the patterns' groups.
+    Layout and docstring do not affect the digest. `self.env.x`, as in containers of rewards, gives the digest of `self.x`.
     """
     code = inspect.unwrap(function).__code__
     node = nodes_of(code.co_filename).get(code.co_qualname, ast.parse(""))
     body = node.body if ast.get_docstring(node) is None else node.body[1:]
     text = re.sub(r"\b(\w+)\.env\b", r"\1", "\n".join(map(ast.unparse, body)))
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    reads = [name for name, pattern in READS.items() if re.search(pattern, text)]
+    reads = {name: found[found.re.groups] for name, pattern in READS.items() if (found := re.search(pattern, text))}
     return {"place": [code.co_filename, code.co_firstlineno], "digest": digest, "reads": reads}
 
 
@@ -366,19 +371,19 @@ def methods_of(classes: list[type], names: list[str]) -> dict[str, list[dict[str
 
 
 def environment_classes(task_class: Any, root: Path) -> list[type]:
-    """Return the task's class if a registry names it. Otherwise, return all classes with rewards in the package, or in the
-    folder of a file outside any package.
+    """Return the task's class if a registry names it. Otherwise, return all classes with rewards or observations in the
+    package, or in the folder of a file outside any package.
     """
     if isinstance(task_class, type):
         return [task_class]
     for file in sorted(root.glob("*.py" if ALONE in sys.modules else "**/*.py"))[:1000]:
         name = module_name(file, root)
-        if b"def _reward_" in file.read_bytes() and name not in sys.modules:
+        if re.search(rb"def (_reward_|compute_observations)", file.read_bytes()) and name not in sys.modules:
             try:
                 importlib.import_module(name)
             except BaseException:
                 sys.modules.pop(name, None)
-    return fork_classes("_reward_")
+    return fork_classes("_reward_", "compute_observations")
 
 
 def replay(function: Any, values: dict[str, Any], others: dict[str, Any]) -> None:
@@ -459,13 +464,14 @@ def answer(request: dict[str, Any]) -> dict[str, Any]:
     else:
         return {"classes": list(own), "tasks": of_file}
     classes = environment_classes(task_class, root)
+    observing = [cls for cls in classes if "compute_observations" in dir(cls)]
     return {
         "task": name,
         "names": [getattr(cls, "__name__", type(cls).__name__) for cls in (environment, learner) if cls is not None],
         "built_in": list(USED),
         "settings": settings(environment) | ({} if learner is None else settings(learner)),
         "methods": methods_of(classes, request["methods"]),
-        "observations": observations(classes[0], environment) if len(classes) == 1 else [None, None],
+        "observations": observations(observing[0], environment) if len(observing) == 1 else [None, None],
         "terrains": terrains(getattr(environment, "terrain", None)),
     }
 

@@ -16,8 +16,6 @@ from legged.migration.translation import DEFAULTS, Translation, is_number
 from legged.terrain import TERRAIN_TYPES
 from legged.terrain.terrain import check_terrain
 
-LONGEST_HISTORY = 20
-"""Longest observation history that `_by_number` tries [steps]."""
 SIGMA = "tracking_sigma"
 OF_HEADING = ("_post_physics_step_callback", "_resample_commands")
 """Methods of legged_gym that use commands[:, 3], the heading."""
@@ -33,7 +31,7 @@ def map_settings(fork: Fork) -> Translation:
     if not result.settings.get("domain_rand.randomize_base_mass", False):
         result.settings.pop("domain_rand.added_mass_range", None)
     _terrain(result, fork)
-    _commands(result)
+    _commands(result, fork)
     _contacts(result)
     _rewards(result, fork)
     _observations(result, fork)
@@ -129,8 +127,17 @@ def _of_whole_columns(shares: dict[str, float], result: Translation) -> tuple[di
     return rounded, out
 
 
-def _commands(result: Translation) -> None:
-    """Map the command curriculum. legged_gym widens the range of vx by 0.5 m/s at a time, up to max_curriculum."""
+def _commands(result: Translation, fork: Fork) -> None:
+    """Map the range of yaw rates in heading mode, where legged_gym clips to a number in its code, and the command curriculum.
+    legged_gym widens the range of vx by 0.5 m/s at a time, up to max_curriculum.
+    """
+    path = "commands.ranges.ang_vel_yaw"
+    if result.get("commands.heading_command") is True:
+        clips = (method.reads["yaw"] for methods in fork.methods.values() for method in methods if "yaw" in method.reads)
+        limit = float(next(clips, 1.0))
+        result.put(path, [-limit, limit], "")
+        if path in result.theirs and result.get(path) != [-limit, limit]:
+            result.lose(path, f"the fork does not use it in heading mode; the range here is its limit there, {limit:g} rad/s")
     limit = result.get("commands.max_curriculum", 0.0)
     speeds = result.get("commands.ranges.lin_vel_x", [])
     if result.get("commands.curriculum", False) is not True or len(speeds) != 2:
@@ -147,13 +154,14 @@ def _commands(result: Translation) -> None:
 
 
 def _contacts(result: Translation) -> None:
-    """Map self-collisions and friction. As in PhysX, the friction range is averaged with the ground's friction."""
-    own = result.get("domain_rand.friction_range", [])
-    ground = result.get("terrain.static_friction", 1.0)
-    if len(own) == 2 and result.get("domain_rand.randomize_friction", False):
-        mean = [round(0.5 * (value + ground), 4) for value in own]
-        comment = f"PhysX averages the robot's {own[0]:g} to {own[1]:g} with the ground's {ground:g}"
-        result.put("domain_rand.friction_range", mean, "domain_rand.friction_range", comment)
+    """Map self-collisions, friction and restitution. PhysX averages the robot's ranges with the ground's values."""
+    for name, ours, of_ground, usual in tables.OF_CONTACTS:
+        path = f"domain_rand.{name}_range"
+        if path in result.theirs and result.get(f"domain_rand.randomize_{name}") is True:
+            pair, ground = result.get(path, []), result.get(f"terrain.{of_ground}", usual)
+            mean = [round(0.5 * (value + ground), 4) for value in pair]
+            told = " to ".join(f"{value:g}" for value in pair)
+            result.put(ours, mean, path, f"PhysX averages the robot's {told} with the ground's {ground:g}")
     path = "asset.self_collisions"
     if path in result.theirs and result.get(path, 1.0) == 0:
         if result.theirs[path].place.startswith("legged_gym's"):
@@ -222,6 +230,8 @@ def _observations(result: Translation, fork: Fork) -> None:
         if own:
             where = fork.methods["compute_observations"][0].place
             text += f"; write a method _obs_<name> for {', '.join(dict.fromkeys(own))} ({where})"
+    if any("normal" in method.reads for method in fork.methods.get("compute_observations", [])):
+        text += "; its noise is normal, here it is uniform: 1.73 times the fork's noise_level has the same variance"
     result.note("observations", text)
     if groups[0]:
         for group, terms in (("actor", groups[0]), ("critic", groups[1] or groups[0])):
@@ -246,17 +256,14 @@ def _terms(parts: list[list[str]], own: list[str]) -> list[str]:
 
 
 def _by_number(result: Translation, number: Any) -> tuple[list[str] | None, int]:
-    """Return legged_gym's terms and the number of steps that give `number` numbers in total; None and 1 if none fit."""
+    """Return legged_gym's terms and the number of steps, at most 20, that give `number` numbers; None and 1 if none fit."""
     joints = int(result.get("env.num_actions", 12.0))
     groups = {12 + 3 * joints: list(STATE_TERMS), 9 + 3 * joints: list(STATE_TERMS[1:])}
     if result.get("terrain.measure_heights", False):
         columns, rows = (result.get(path, []) for path in tables.OF_HEIGHTS)
         groups = {size + len(columns) * len(rows): [*terms, "heights"] for size, terms in groups.items()} | groups
-    for history in range(1, LONGEST_HISTORY + 1):
-        for size, terms in groups.items():
-            if number == history * size:
-                return terms, history
-    return None, 1
+    fits = ((groups[size], steps) for steps in range(1, 21) for size in groups if number == steps * size)
+    return next(fits, (None, 1))
 
 
 def _recurrent(result: Translation) -> None:
@@ -319,8 +326,7 @@ def _hooks(result: Translation, fork: Fork) -> None:
     hooks = [f"{name} ({own[name].place})" for name in own if not name.startswith(("_reward_", "compute_observations"))]
     if hooks:
         result.note("methods", f"move the fork's own methods by hand (docs/migrating.md): {', '.join(hooks)}")
-    fourth = [name for name, method in own.items() if "fourth" in method.reads and name not in OF_HEADING]
-    readers = [f"{name} ({own[name].place})" for name in fourth]
+    readers = [f"{name} ({m.place})" for name, m in own.items() if "fourth" in m.reads and name not in OF_HEADING]
     if readers:
         result.note("commands", f"commands[:, 3] is the heading here, and no column follows it; check {', '.join(readers)}")
 

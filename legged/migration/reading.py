@@ -47,8 +47,8 @@ class Method:
     place: str
     original: bool
     """True if the method is the same as legged_gym's method of that name."""
-    reads: tuple[str, ...]
-    """Names of `child.READS` that the method reads."""
+    reads: dict[str, str]
+    """Name in `child.READS` that the method reads -> text of the pattern's group."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def read_fork(path: Path, asked: str | None) -> Fork:
             settings = missing | settings
     built_in = f"; {', '.join(sorted(data['built_in']))} from legged_gym v1.0.2" if data["built_in"] else ""
     methods = {
-        name: [Method(_place(*m["place"]), m["digest"] == DIGESTS.get(name), tuple(m["reads"])) for m in entries]
+        name: [Method(_place(*m["place"]), m["digest"] == DIGESTS.get(name), m["reads"]) for m in entries]
         for name, entries in data["methods"].items()
     }
     names = [*data["names"], "no learner's configuration"][:2]

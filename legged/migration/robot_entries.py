@@ -77,6 +77,9 @@ def map_robot(result: Translation, robot: Robot | None) -> dict[str, Any]:
     other = f"; the fork has {count} actions" if count not in (None, robot.num_dof) else ""
     order = f"in the order {few}{', ...' if robot.num_dof > MOST_NAMES else ''}"
     text = f"{robot.name} has {robot.num_dof} joints {order}{other}; Isaac Gym's order may differ: index them by name"
+    armature, rotors = result.get("asset.armature", 0.0), robot.armature
+    if not np.allclose(rotors, armature):
+        text += f"; its rotor inertias are {min(rotors):g} to {max(rotors):g} kg m^2, those of the fork {armature:g}"
     result.note("robot", text)
     return entries
 

@@ -62,9 +62,13 @@ ABSENT = {
 }
 """Setting of a fork -> value of its counterpart if the fork lacks the setting. This package's default would add something
 that the fork does not do."""
+OF_CONTACTS = (
+    ("friction", "domain_rand.friction_range", "static_friction", 1.0),
+    ("restitution", "domain_rand.ranges.restitution", "restitution", 0.0),
+)
+"""Property of contacts, setting of this package, and the ground's setting in a fork with its default."""
 RANDOM_MODEL = {
     "link_mass": "link_mass",
-    "restitution": "restitution",
     "motor_strength": "motor_strength motor:motor_strength motor_torque",
     "base_com_x base_com_y base_com_z": "com_displacement base_com:added_com",
     "p_gain": "kp Kp Kp_factor gains:stiffness_multiplier",

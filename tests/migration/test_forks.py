@@ -233,13 +233,16 @@ def test_observations_that_cannot_be_told_are_not_guessed_by_their_number(fork, 
 @pytest.mark.slow
 def test_ranges_and_switches_that_a_fork_does_not_have_are_off(fork, migrated):
     """An absent lin_vel_y was [-1, 1], and pushes of 1 m/s were added."""
-    data = migrated(textwrap.dedent(CONFIG), path=fork()).data
+    result = migrated(textwrap.dedent(CONFIG), path=fork())
+    data = result.data
     assert data["commands"] == {
         "ranges": {"lin_vel_x": [0.0, 1.0], "lin_vel_y": [0.0, 0.0], "ang_vel_yaw": [0.0, 0.0]},
         "resampling_time_s": 5.0,
         "heading_command": False,
     }
     assert data["domain_rand"] == {"randomize_friction": False, "push_robots": False}
+    assert any("terrain.static_friction = 0.5: the ground has no friction here" in line for line in result.lost)
+    assert "domain_rand.friction_range" in result.plain
     assert data["rewards"]["only_positive_rewards"] is False
     assert data["observations"]["add_noise"] is False
 
@@ -364,6 +367,65 @@ def test_settings_of_forks_go_to_the_fields_that_are_here(migrated, section, lin
     assert "does not load yet" not in result.out
     if path != "observations.groups.actor.history":
         built(result)
+
+
+@pytest.mark.parametrize(("ground", "values"), [("0.", [0.0, 0.5]), ("0.4", [0.2, 0.7])])
+def test_restitution_is_averaged_with_the_grounds(migrated, ground, values):
+    """The robot's own range was taken for the contact's."""
+    lines = "randomize_restitution = True\nrestitution_range = [0., 1.]"
+    result = migrated(sections(domain_rand=lines, terrain=f"restitution = {ground}"))
+    assert result.data["domain_rand"]["ranges"]["restitution"] == values
+    assert f"PhysX averages the robot's 0 to 1 with the ground's {float(ground):g}\n" in result.out
+    assert result.lost == []
+
+
+def test_an_unused_range_of_yaw_rates_does_not_limit_heading_mode(migrated):
+    """legged_gym clips that yaw rate to 1 rad/s; the range, 0.3 rad/s, limited it."""
+    ranges = "class ranges(LeggedRobotCfg.commands.ranges):\n    ang_vel_yaw = [-0.3, 0.3]"
+    result = migrated(sections(commands=ranges))
+    assert "commands" not in result.data  # -1 to 1 rad/s is the default here
+    (lost,) = result.lost
+    assert lost.endswith("[-0.3, 0.3]: the fork does not use it in heading mode; the range here is its limit there, 1 rad/s")
+    turning = migrated(sections(commands=f"heading_command = False\n{ranges}"), "--force")
+    assert turning.data["commands"]["ranges"] == {"ang_vel_yaw": [-0.3, 0.3]}
+    assert turning.lost == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("given", "limit"), [("-2., 2.", 2.0), ("-1.5, 1.5", 1.5)])
+def test_the_limit_of_heading_mode_is_read_from_the_forks_method(fork, migrated, given, limit):
+    step = f"""
+        def _post_physics_step_callback(self):
+            heading = self.yaw()
+            self.commands[:, 2] = torch.clip(0.5 * wrap_to_pi(self.commands[:, 3] - heading), {given})
+    """
+    config = CONFIG.replace("num_commands = 5", "heading_command = True")
+    data = migrated(textwrap.dedent(config), path=fork(dog=ENV.rstrip() + "\n" + step)).data
+    assert data["commands"]["ranges"]["ang_vel_yaw"] == [-limit, limit]
+
+
+PUP = """
+import torch
+
+class Pup:
+    def step(self, actions):
+        return actions / 2
+
+    def compute_observations(self):
+        self.obs_buf = torch.cat((self.projected_gravity, self.actions), dim=-1)
+        self.obs_buf += torch.randn_like(self.obs_buf) * self.noise_scale_vec
+"""
+
+
+def test_the_class_of_the_environment_is_read_if_another_class_has_the_rewards(migrated):
+    """Only the class with rewards was read: observations were guessed, and no method was listed."""
+    written(PUP, "pup.py")
+    written("class Rewards:\n    def _reward_prance(self):\n        return self.env.prance\n", "rewards.py")
+    result = migrated(sections(rewards="class scales:\n    prance = 0.5"))
+    assert result.data["observations"]["groups"]["actor"]["terms"] == ["projected_gravity", "actions"]
+    assert "move the fork's own methods by hand (docs/migrating.md): step (pup.py:5)\n" in result.out
+    assert "paste: _reward_prance (rewards.py:2), then set rewards.scales.prance: 0.5\n" in result.out
+    assert "its noise is normal, here it is uniform: 1.73 times the fork's noise_level has the same variance\n" in result.out
 
 
 NAMED = [

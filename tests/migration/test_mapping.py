@@ -184,6 +184,14 @@ def test_joints_without_gains_have_none_and_are_listed(migrated):
     assert "has no value for LF_KFE, RF_KFE, LH_KFE, RH_KFE; legged_gym then uses 0" in lost
 
 
+def test_rotor_inertias_that_the_fork_does_not_have_are_told(migrated):
+    """The robot here has those of its motors; the fork's armature is 0."""
+    result = migrated(BASE + FLAT, "--robot", "a1")
+    assert "; its rotor inertias are 0.01 to 0.01 kg m^2, those of the fork 0\n" in result.out
+    same = migrated(sections(asset="armature = 0.01"), "--robot", "a1", "--force")
+    assert "rotor inertias" not in same.out
+
+
 def test_what_is_known_of_legged_gym_is_complete():
     """Every setting of its base configuration goes somewhere: its defaults and ours, a task of both, are one task."""
     assert set(DEFAULTS) >= {"env", "terrain", "commands", "init_state", "control", "asset", "domain_rand", "rewards"}
