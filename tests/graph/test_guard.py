@@ -20,8 +20,10 @@ FIVE = torch.tensor([5.0, 6.0])
 ARRAY = np.array([1.0, 2.0, 3.0])
 
 
-def write_by_mask() -> None:
-    NUMBERS.clone()[MASK] = 0.0
+def write_by_mask() -> torch.Tensor:
+    numbers = NUMBERS.clone()
+    numbers[MASK] = 0.0
+    return numbers
 
 
 def write_by_mask_tensor() -> None:
@@ -44,7 +46,6 @@ REFUSED = {
     "where with one argument": lambda: torch.where(MASK),
     "argwhere": lambda: torch.argwhere(MASK),
     "read by mask": lambda: NUMBERS[MASK],
-    "write a number by mask": write_by_mask,
     "write a tensor by mask": write_by_mask_tensor,
     "read by a mask of bytes": lambda: NUMBERS[MASK.to(torch.uint8)],
     "masked_select": lambda: NUMBERS.masked_select(MASK),
@@ -103,6 +104,7 @@ REFUSED = {
 ALLOWED = {
     "where": lambda: torch.where(MASK, NUMBERS, 0.0),
     "masked_fill": lambda: NUMBERS.masked_fill(MASK, 0.0),
+    "write a number by mask": write_by_mask,
     "read by positions": lambda: NUMBERS[FIRST_AND_LAST],
     "read by a number": lambda: (NUMBERS[ONE], GRID[ONE, 1:], GRID[:, ONE], GRID[..., ONE], GRID[None, ..., ONE, :]),
     "read by numbers": lambda: (GRID[ONE, ONE + 1], GRID[1:, -ONE], GRID[ONE, [0, 2]], [GRID[:, i] for i in FIRST_AND_LAST]),
