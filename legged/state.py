@@ -1,19 +1,9 @@
-"""Saving and loading of an object's state, which consists of the tensors that are listed in `STATE` of the class. The seed of
-the host's random generators.
-"""
+"""Saving and loading of an object's state. The state consists of the tensors that are listed in `STATE` of the class."""
 
-import random
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from torch import Tensor
-
-
-def seed_host(seed: int) -> None:
-    """Seed the global random generators of Python and NumPy, which methods of users may read."""
-    random.seed(seed)
-    np.random.seed(seed % 2**32)
 
 
 class StateError(ValueError):

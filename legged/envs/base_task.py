@@ -5,10 +5,12 @@ The terms of a task (observations, rewards, terminations and metrics) are method
 one row for each environment. Tensors keep their addresses, so that one CUDA graph can hold the whole step.
 """
 
+import random
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -33,7 +35,6 @@ from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool
 from legged.physics import Scene
 from legged.process.ranks import Ranks
-from legged.state import seed_host
 
 
 class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
@@ -392,3 +393,9 @@ class BaseTask(ObservingTask, JudgingTask, PrivilegedTerms, SavedTask, VecEnv):
 
     def reset_curricula(self) -> None:
         """Reset curricula to the start of training."""
+
+
+def seed_host(seed: int) -> None:
+    """Seed the global random generators of Python and NumPy, which methods of users may read."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from legged.config import LeggedConfig, TaskConfig
 from legged.envs import BaseTask
 from legged.envs.actions import ordinary_tensors
+from legged.envs.base_task import seed_host
 from legged.envs.checks import evaluated_figures
 from legged.evaluation.velocity_grid import Grid, axes_of
 from legged.evaluation.velocity_tracking import place_to_track
@@ -21,7 +22,6 @@ from legged.policies.actor import Actor
 from legged.policies.episodes import unit_of
 from legged.policies.restore import nominal
 from legged.registry import make_task, task_class
-from legged.state import seed_host
 
 HOLD_S = 3.0
 """Default time for which a command is held [s]."""

@@ -43,7 +43,7 @@ def test_an_old_engine_is_named_whatever_went_wrong(installed, capsys):
 
 
 def test_a_missing_package_is_named_after_a_failed_import_alone(installed, capsys):
-    """A robot's computer has few of them, and a fault of the program there is none of theirs."""
+    """A robot's computer lacks most packages, and other errors there have other causes."""
     installed(rich=None, onnx=None)
     say_unmet(ModuleNotFoundError, ModuleNotFoundError("No module named 'rich'"), None)
     expected = "error: legged needs onnx (missing), rich (missing): pip install 'onnx' 'rich' (ModuleNotFoundError: "
