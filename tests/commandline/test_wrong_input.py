@@ -395,12 +395,12 @@ MISTAKES = {
     ),
     "fails": (
         "def _reward_mine(self): return self.no_such_thing",
-        "_reward_mine: 'Mine' object has no attribute 'no_such_thing' (",
+        "_reward_mine: 'Mine' object has no attribute 'no_such_thing'",
     ),
     "wrong shape": ("def _reward_mine(self): return self.base_pos", "_reward_mine: must return a tensor (4,), got (4, 3)"),
     "constructor fails": (
         "def __init__(self, *args, **kwargs): self.nothing_of_that",
-        "AttributeError: 'Mine' object has no attribute 'nothing_of_that' (",
+        "AttributeError: 'Mine' object has no attribute 'nothing_of_that'",
     ),
     "constructor calls nobody": (
         "def __init__(self, *args, **kwargs): pass",
