@@ -24,8 +24,8 @@ from legged.learning.evaluations import Ended
 from legged.learning.logger import Interrupted
 from legged.learning.ppo import DevicePPO
 from legged.learning.rollout import Rollout, Steps
+from legged.learning.row_threads import RowThreads
 from legged.learning.runner import Runner
-from legged.learning.update_threads import UpdateThreads
 from legged.process.cores import available_cores
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
@@ -55,6 +55,8 @@ class CapturedRunner(Runner):
         if isinstance(self.alg.actor, EstimatingModel):
             errors = EstimationErrors(env.observation_groups[ESTIMATED])
             self.alg.learn_to_estimate(errors, env.cfg.train.policy.estimator.learning_rate)
+        if torch.device(device).type == "cpu":
+            self.alg.threads = RowThreads(env.cfg.sim.threads or available_cores() // Ranks.now().local_count)
         self.why_stock = self.alg.why_stock
         """Reason why training uses rsl-rl's own loop; empty if it does not."""
         if torch.device(device) != torch.device(env.device):  # type: ignore[arg-type]
@@ -78,7 +80,6 @@ class CapturedRunner(Runner):
             length = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(length, high=int(self.env.max_episode_length))
         self.logger.init_logging_writer()
-        threads = UpdateThreads(self.env.cfg.sim.threads or available_cores() // Ranks.now().local_count)
         first = self.current_learning_iteration
         total = first + num_learning_iterations
         clock: Clock | None = None
@@ -87,8 +88,7 @@ class CapturedRunner(Runner):
             clock = Clock(torch.device(self.device), clock)
             collect()
             clock.lap()
-            with threads.use():
-                (update_critic if iteration < warmup else update)()
+            (update_critic if iteration < warmup else update)()
             clock.lap()
             self.current_learning_iteration = iteration
             launched = LaunchedIteration(iteration, first, total, self._read(rollout), clock)

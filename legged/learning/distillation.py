@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from legged.learning.distributed import SharedGradients
 from legged.learning.networks import action_std, output_of, update_normalizer
 from legged.learning.recurrent import Memory
+from legged.learning.row_threads import RowThreads
 
 
 class DeviceDistillation(Distillation):
@@ -32,7 +33,7 @@ class DeviceDistillation(Distillation):
             warnings.simplefilter("ignore")
             super().__init__(student, teacher, *args, **kwargs)
         name = kwargs.get("optimizer", "adam")
-        parameters = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
+        self._learned = parameters = [parameter for parameter in self.student.parameters() if parameter.requires_grad]
         self.why_stock = "train.runner.loop is stock" if stock else "" if name == "adam" else f"the optimiser is {name}"
         """Reason why rsl-rl's own update is used; empty if it is not."""
         if self.why_stock:
@@ -50,6 +51,7 @@ class DeviceDistillation(Distillation):
         """Hidden state before the first step of the stored rollout."""
         self._losses = torch.zeros(2, device=self.device)
         """Mean loss of the last update, and the share of its gradients that were finite and used."""
+        self.threads = RowThreads()
         self.left_out = 0.0
         """Share of the last update's gradients that were NaN or infinite and therefore not used."""
 
@@ -113,9 +115,16 @@ class DeviceDistillation(Distillation):
         """Learn once from all steps of `inputs` (T, N, W). The steps of one gradient form one batch."""
         labels = self.storage.privileged_actions
         for x, wanted in zip(inputs.split(self.gradient_length), labels.split(self.gradient_length), strict=True):
-            actions = output_of(self.student, x.flatten(0, 1), self.use_mixed_precision)
-            # rsl-rl adds up the mean losses of single steps. That sum is the mean over all steps times their number.
-            self._descend(len(x) * self.loss_fn(actions, wanted.flatten(0, 1)))
+            self._forget_gradients()
+            self._step(self.threads.backward(self._gradients, (x.flatten(0, 1), wanted.flatten(0, 1)), self._learned))
+
+    def _gradients(self, inputs: Tensor, wanted: Tensor) -> tuple[Sequence[Tensor], Tensor]:
+        """Return the gradients for inputs (n, width) and wanted actions (n, D) of a gradient's steps, and the mean loss (1,).
+
+        rsl-rl adds up the mean losses of single steps. That sum is the mean over all steps times their number.
+        """
+        mean = self.loss_fn(output_of(self.student, inputs, self.use_mixed_precision), wanted)
+        return torch.autograd.grad(self.gradient_length * mean, self._learned), mean.detach().unsqueeze(0)
 
     def _epoch_with_memory(self, inputs: Tensor) -> None:
         """Learn once from all steps of `inputs` (T, N, W), in order, starting from the hidden state before the first step."""
@@ -133,20 +142,26 @@ class DeviceDistillation(Distillation):
         self.memory.take(memory.parts)
 
     def _descend(self, loss: Tensor) -> None:
-        """Take a gradient step, unless a gradient is NaN or infinite. `loss` () is a sum over `gradient_length` steps."""
-        mean = loss.detach() / self.gradient_length
+        """Take a gradient step. `loss` () is a sum over `gradient_length` steps."""
+        self._forget_gradients()
+        loss.backward()
+        self._step(loss.detach().unsqueeze(0) / self.gradient_length)
+
+    def _forget_gradients(self) -> None:
         if self.is_multi_gpu:
             self._shared.zero_()
-            loss.backward()
-            self._shared.average_(mean)
         else:
             self.optimizer.zero_grad()
-            loss.backward()
+
+    def _step(self, mean: Tensor) -> None:
+        """Take a gradient step, unless the `mean` loss (1,) or a gradient is NaN or infinite."""
+        if self.is_multi_gpu:
+            self._shared.average_(mean[0])
         norm = nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm or torch.inf)
-        fine = (norm + mean) < torch.inf
+        fine = (norm + mean[0]) < torch.inf
         torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
         self.optimizer.step()
-        self._losses += torch.where(fine, torch.stack([mean, torch.ones_like(mean)]), 0.0)
+        self._losses += torch.where(fine, torch.cat([mean, torch.ones_like(mean)]), 0.0)
 
     def save(self) -> dict:
         """Return the parts of a checkpoint: the student as `actor`, the teacher, and the optimiser. The optimiser has

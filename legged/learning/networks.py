@@ -14,7 +14,6 @@ from torch import Tensor
 from legged.config import TaskConfig
 from legged.config.networks import ESTIMATED, NETWORKS, groups_of
 from legged.config.schema import PolicyConfig
-from legged.learning.cpu_layers import apply_layers
 from legged.learning.distributed import sum_over_ranks_
 from legged.learning.estimator import TARGETS
 
@@ -144,14 +143,7 @@ def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
     """
     # A graph must cast the weights at every replay, so autocast must not cache the cast weights.
     with torch.autocast(inputs.device.type, torch.bfloat16, mixed_precision, cache_enabled=False):
-        return layers_of(model.mlp, model.obs_normalizer(inputs), mixed_precision)
-
-
-def layers_of(layers: torch.nn.Sequential, x: Tensor, mixed_precision: bool) -> Tensor:
-    """Apply `layers` to `x` (n, width) and return the outputs (n, outputs), float32."""
-    if x.device.type == "cpu" and not mixed_precision:
-        return apply_layers(layers, x)
-    return layers(x).float()
+        return model.mlp(model.obs_normalizer(inputs)).float()
 
 
 @torch.no_grad()

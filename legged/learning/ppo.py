@@ -12,19 +12,22 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.modules.normalization import EmpiricalNormalization
 from torch import Tensor
 
+from legged.learning import closed_form
+from legged.learning.closed_form import HALF_LOG_2PI
 from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.distributed import SharedGradients
 from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
-from legged.learning.networks import action_std, layers_of, output_of, update_normalizer
+from legged.learning.networks import action_std, output_of, update_normalizer
+from legged.learning.row_threads import RowThreads
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate, and the factor by which one adaptation raises or lowers it, as in rsl-rl."""
 FEW = 1e-8
+ADVANTAGES = 4
+"""Position of the advantages among the tensors of a mini-batch."""
 LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 """Logged losses of an update, by rsl-rl's names. `kl` is the divergence from the policy that acted to the policy that learns.
 `symmetry` is the mean square difference between the policy and its mirror image, logged only if symmetry is on."""
-HALF_LOG_2PI = 0.9189385332046727
-"""Constant 0.5 * log(2 pi)."""
 
 
 class DevicePPO(CriticWarmup):
@@ -44,19 +47,24 @@ class DevicePPO(CriticWarmup):
         """Reason why rsl-rl's own update is used; empty if it is not."""
         if not self.why_stock:
             self._rate = torch.tensor(self._initial_rate, device=self.device)
-            parameters = [p for part in self._parts() for p in part]
+            self._learned = [parameter for part in self._parts() for parameter in part]
             capturable = self._rate.is_cuda
             self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
             # While found_inf is 1, a fused step leaves the parameters, the moments and the step count unchanged.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
             if self.is_multi_gpu:
-                self._shared = SharedGradients(parameters, self.gpu_world_size)
+                self._shared = SharedGradients(self._learned, self.gpu_world_size)
         count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
         self._errors: EstimationErrors | None = None
         self._losses = torch.zeros(count + 1, device=self.device)
         """Means over the mini-batches of the last update: the losses in the order of `LOSSES`, the square estimation error of
         each term if there is an estimator, and the share of mini-batches that were used."""
-        self._one = torch.ones((), device=self.device)
+        self._one = torch.ones(1, device=self.device)
+        self.threads = RowThreads()
+        plain = not self.why_stock and type(self.actor) is MLPModel and not self.use_mixed_precision
+        self._in_closed_form = (
+            plain and self.device == "cpu" and all(closed_form.fits(model.mlp) for model in (self.actor, self.critic))
+        )
         self._critic_alone = False
         """True while an update of the value function alone runs or is captured."""
         self.left_out = 0.0
@@ -242,13 +250,82 @@ class DevicePPO(CriticWarmup):
         if isinstance(self.actor, EstimatingModel):
             columns.append((torch.cat([observations[name] for name in self.actor.target_groups], dim=-1), imaged))
         shuffled = [column.index_select(0, index.flatten()).split(index.shape[1]) for column, index in columns]
+        if self.normalize_advantage_per_mini_batch:
+            own = [advantages[:count] for advantages in shuffled[ADVANTAGES]]
+            shuffled[ADVANTAGES] = tuple(
+                (advantages - samples.mean()) / (samples.std() + FEW)
+                for advantages, samples in zip(shuffled[ADVANTAGES], own, strict=True)
+            )
         return list(zip(*shuffled, strict=True))
 
     def _order(self, count: int) -> Tensor:
         """Return a random permutation of `count` samples, found by sorting random numbers. A CUDA graph can hold a sort."""
         return torch.rand(count, device=self.device).argsort()
 
-    def _step(
+    def _step(self, *batch: Tensor) -> Tensor:
+        """Adapt the learning rate and take a gradient step on a mini-batch of `_mini_batches`. Return its figures (`_loss`)
+        and a count of 1. If a gradient or the value loss is NaN or infinite, return zeros without a step.
+        """
+        if self.is_multi_gpu:
+            self._shared.zero_()
+        else:
+            self.optimizer.zero_grad()
+        figures = self.threads.backward(self._gradients, batch, self._learned)
+        # If the critic returns NaN, the gradient of the clipped value loss may be finite, so the loss is checked as well.
+        kl, valued = figures[LOSSES.index("kl")], figures[LOSSES.index("value")].clone()
+        if self.is_multi_gpu:
+            self._shared.average_(kl, valued)  # this writes the means over all processes into both
+        if self._critic_alone:
+            return self._step_critic(figures, valued)
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            self._adapt_rate(kl)
+        fine = (self._clip_gradients() + valued) < torch.inf
+        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
+        self.optimizer.step()
+        return torch.where(fine, torch.cat([figures, self._one]), 0.0)
+
+    def _gradients(self, *batch: Tensor) -> tuple[Sequence[Tensor | None], Tensor]:
+        """Return the gradient of a mini-batch's loss by each learned parameter, and the figures (K,) of `_loss`."""
+        if self._in_closed_form:
+            return self._gradients_in_closed_form(*batch)
+        loss, figures = self._loss(*batch)
+        return torch.autograd.grad(loss, self._learned, allow_unused=True), figures
+
+    @torch.no_grad()
+    def _gradients_in_closed_form(
+        self,
+        actor_input: Tensor,
+        critic_input: Tensor,
+        actions: Tensor,
+        old_log_prob: Tensor,
+        advantages: Tensor,
+        old_values: Tensor,
+        returns: Tensor,
+        old_mean: Tensor,
+        old_std: Tensor,
+    ) -> tuple[Sequence[Tensor | None], Tensor]:
+        """Return the same as `_gradients` without autograd."""
+        actor, critic = self.actor, self.critic
+        with torch.enable_grad():
+            bounded = self.action_std()
+        std = bounded.detach()
+        acted = closed_form.forward(actor.mlp, actor.obs_normalizer(actor_input))
+        valued = closed_form.forward(critic.mlp, critic.obs_normalizer(critic_input))
+        mean, rows = acted[0][-1], len(actions)
+        surrogate, by_mean, by_std = closed_form.surrogate_loss(mean, std, actions, old_log_prob, advantages, self.clip_param)
+        errors, by_value = closed_form.value_loss(
+            valued[0][-1].squeeze(-1), returns, old_values, self.clip_param if self.use_clipped_value_loss else None
+        )
+        figures = self._figures(mean, std, old_mean, old_std, errors.mean(), surrogate.mean())
+        of_critic = closed_form.backward(critic.mlp, *valued, (self.value_loss_coef / rows * by_value).unsqueeze(-1))
+        found = dict(zip(critic.mlp.parameters(), of_critic, strict=True))
+        if not self._critic_alone:
+            found |= zip(actor.mlp.parameters(), closed_form.backward(actor.mlp, *acted, by_mean / rows), strict=True)
+            (learned_std,) = actor.distribution.parameters()
+            found[learned_std] = torch.autograd.grad(bounded, learned_std, by_std / rows - self.entropy_coef / std)[0]
+        return [found.get(parameter) for parameter in self._learned], figures
+
+    def _loss(
         self,
         actor_input: Tensor,
         critic_input: Tensor,
@@ -260,19 +337,15 @@ class DevicePPO(CriticWarmup):
         old_mean: Tensor,
         old_std: Tensor,
         targets: Tensor | None = None,
-    ) -> Tensor:
-        """Adapt the learning rate and take a gradient step on one mini-batch. Return its losses in the order of `LOSSES`, its
-        estimation errors, and a count of 1. If a gradient or the value loss is NaN or infinite, return zeros without a step.
+    ) -> tuple[Tensor, Tensor]:
+        """Return the loss () of a mini-batch, and its figures (K,): the losses in the order of `LOSSES`, and the estimation
+        errors.
         """
         samples = len(old_mean)
-        if self.normalize_advantage_per_mini_batch:
-            own = advantages[:samples]
-            advantages = (advantages - own.mean()) / (own.std() + FEW)
         mean, estimates = self._act(actor_input)
         values = output_of(self.critic, critic_input, self.use_mixed_precision).squeeze(-1)
         std = self.action_std()
         log_prob = gaussian_log_prob(actions, mean, std)
-        entropy = std.log().sum() + actions.shape[1] * (0.5 + HALF_LOG_2PI)
         ratio = torch.exp(log_prob - old_log_prob)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
@@ -281,43 +354,33 @@ class DevicePPO(CriticWarmup):
             near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
             value_loss = torch.max(value_loss, (near - returns).square())
         value_loss = value_loss.mean()
-        loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
-        errors: tuple[Tensor, ...] = ()
+        loss = self.value_loss_coef * value_loss
+        if not self._critic_alone:
+            loss = loss + surrogate - self.entropy_coef * entropy(std)
+        figures = self._figures(mean, std, old_mean, old_std, value_loss, surrogate)
         if targets is not None and estimates is not None:
             # One backward pass serves PPO's loss and the estimator's. PPO's loss also trains the estimator's hidden layers if
             # there are `latent` outputs, and the whole estimator if `policy_gradient` is set.
-            loss = loss + (estimates - targets).square().mean()
+            if not self._critic_alone:
+                loss = loss + (estimates - targets).square().mean()
             assert self._errors is not None
-            errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0).unbind()
+            errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0)
+            figures = torch.cat([figures, errors])
+        return loss, figures
 
-        losses = [value_loss, surrogate, entropy]
+    @torch.no_grad()
+    def _figures(
+        self, mean: Tensor, std: Tensor, old_mean: Tensor, old_std: Tensor, value_loss: Tensor, surrogate: Tensor
+    ) -> Tensor:
+        """Return the losses (K,) in the order of `LOSSES`."""
+        samples = len(old_mean)
+        losses = [value_loss, surrogate, entropy(std), divergence(old_mean, old_std, mean[:samples], std)]
         if self.symmetry:
             images = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=None, actions=mean[:samples])[1]
             losses.append((mean[samples:] - images[samples:]).square().mean())
+        return torch.stack(losses)
 
-        kl = divergence(old_mean, old_std, mean[:samples].detach(), std.detach())
-        losses.insert(LOSSES.index("kl"), kl)  # below, `average_` writes the mean over all processes into `kl`
-        # If the critic returns NaN, the gradient of the clipped value loss may be finite, so the loss is checked as well.
-        valued = value_loss.detach().clone()
-        if self._critic_alone:
-            loss = self.value_loss_coef * value_loss
-        if self.is_multi_gpu:
-            self._shared.zero_()
-            loss.backward()
-            self._shared.average_(kl, valued)
-        else:
-            self.optimizer.zero_grad()
-            loss.backward()
-        if self._critic_alone:
-            return self._step_critic([*losses, *errors], valued)
-        if self.desired_kl is not None and self.schedule == "adaptive":
-            self._adapt_rate(kl)
-        fine = (self._clip_gradients() + valued) < torch.inf
-        torch.logical_not(fine, out=self.optimizer.found_inf)  # type: ignore[attr-defined]
-        self.optimizer.step()
-        return torch.where(fine, torch.stack([*losses, *errors, self._one]).detach(), 0.0)
-
-    def _step_critic(self, figures: list[Tensor], valued: Tensor) -> Tensor:
+    def _step_critic(self, figures: Tensor, valued: Tensor) -> Tensor:
         """Take a gradient step of the value function alone. Return `figures`, followed by a count of 1; or return zeros if
         the value loss `valued` () or a gradient is NaN or infinite.
 
@@ -332,7 +395,7 @@ class DevicePPO(CriticWarmup):
         self.optimizer.step()
         for parameter, gradient in of_actor:  # restored: with several processes, gradients are views of a shared buffer
             parameter.grad = gradient
-        return torch.where(fine, torch.stack([*figures, self._one]).detach(), 0.0)
+        return torch.where(fine, torch.cat([figures, self._one]), 0.0)
 
     def _clip_gradients(self) -> Tensor:
         """Clip the gradients of actor, critic and estimator, each to the norm `max_grad_norm`, as torch's clip_grad_norm_
@@ -356,8 +419,8 @@ class DevicePPO(CriticWarmup):
             return output_of(actor, inputs, mixed), None
         with torch.autocast(inputs.device.type, torch.bfloat16, mixed, cache_enabled=False):
             x = actor.obs_normalizer(inputs)
-            found = layers_of(actor.estimator, x, mixed)
-            return layers_of(actor.mlp, actor.joined(x, found), mixed), found[:, : actor.estimates]
+            found = actor.estimator(x).float()
+            return actor.mlp(actor.joined(x, found)).float(), found[:, : actor.estimates]
 
     def action_std(self) -> Tensor:
         """Return the standard deviation (D,) of the actions."""
@@ -386,6 +449,11 @@ def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> 
     """
     moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
     return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+
+
+def entropy(std: Tensor) -> Tensor:
+    """Return the entropy () of a Gaussian of standard deviation (D,)."""
+    return std.log().sum() + len(std) * (0.5 + HALF_LOG_2PI)
 
 
 def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import onnxruntime
@@ -16,7 +17,7 @@ from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.networks import action_std, build_actor
+from legged.learning.networks import action_std, build_actor, use_matmul
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import TrainedPolicy, restore
@@ -354,3 +355,13 @@ def test_building_an_actor_draws_no_random_numbers():
     torch.manual_seed(5)
     build_actor(task.cfg, task.get_observations(), task.num_actions)
     assert torch.equal(torch.rand(3), wanted)
+
+
+@pytest.mark.parametrize("matmul", ["tf32", "float32"])
+def test_matrices_are_multiplied_in_float32_on_a_cpu(matmul):
+    """Rounded to bfloat16, the products of 300 numbers of size 1 would be off by some 0.05, in TF32 by 0.01."""
+    cfg = small_config()
+    use_matmul(replace(cfg, train=replace(cfg.train, runner=replace(cfg.train.runner, matmul=matmul))))
+    generator = torch.Generator().manual_seed(1)
+    a, b = (torch.randn(300, 300, generator=generator) for _ in range(2))
+    torch.testing.assert_close((a @ b).double(), a.double() @ b.double(), atol=2e-4, rtol=0.0)

@@ -1,0 +1,53 @@
+"""Gradients on a CPU: a mini-batch is split into chunks that fit a core's cache, and threads compute their gradients."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+from torch import Tensor
+
+CHUNK = 2048
+"""Most rows of a chunk. The activations of a chunk stay in the cache of a core, those of a whole mini-batch do not."""
+
+
+class RowThreads:
+    """Threads that compute the gradient of a mean over rows.
+
+    Chunks have a fixed size and their gradients are added in order, so the result does not depend on the number of threads. A
+    core that other programs use too computes fewer chunks.
+    """
+
+    def __init__(self, count: int | None = None) -> None:
+        """Take the number of threads. With None, the rows are not split, as a GPU wants it."""
+        self._splits = count is not None
+        several = count is not None and count > 1
+        self._pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) if several else None
+
+    def backward(
+        self,
+        gradients: Callable[..., tuple[Sequence[Tensor | None], Tensor]],
+        batch: Sequence[Tensor],
+        parameters: Sequence[torch.nn.Parameter],
+    ) -> Tensor:
+        """Add the gradient of a mini-batch's loss to the `parameters`, and return the figures (K,) of the mini-batch.
+
+        `batch` has tensors of n rows, or of 2 n, if mirror images of the rows follow them. `gradients` takes the same rows of
+        all tensors. It returns a gradient or None for each parameter, and the figures (K,), all of them means over the rows.
+        """
+        rows, most = min(map(len, batch)), max(map(len, batch))
+        size = max(CHUNK * rows // most, 1) if self._splits else rows
+
+        def chunk(start: int) -> tuple[Sequence[Tensor | None], Tensor, float]:
+            stop = min(start + size, rows)
+            own = batch if stop - start == rows else [x.unflatten(0, (-1, rows))[:, start:stop].flatten(0, 1) for x in batch]
+            return *gradients(*own), (stop - start) / rows
+
+        total = torch.zeros((), device=batch[0].device)
+        for found, figures, share in (self._pool.map if self._pool else map)(chunk, range(0, rows, size)):
+            total = total + share * figures
+            for parameter, gradient in zip(parameters, found, strict=True):
+                if gradient is not None and parameter.grad is not None:
+                    parameter.grad.add_(gradient, alpha=share)
+                elif gradient is not None:
+                    parameter.grad = gradient if share == 1.0 else share * gradient
+        return total
