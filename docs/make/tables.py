@@ -21,6 +21,7 @@ from legged.cli.list import tasks as descriptions
 from legged.commandline.command import run_main
 from legged.errors import ConfigError
 from legged.learning.timing import read_timing
+from legged.process.paths import relative
 
 ROOT = Path(__file__).resolve().parents[2]
 MARKED = re.compile(r"(<!-- table: ([^\n]*?) -->\n)(.*?)(<!-- end -->|(?=<!-- table:)|\Z)", re.DOTALL)
@@ -96,7 +97,7 @@ def read(folder: Path, name: str) -> Result:
     """
     path = folder / f"{name}.json"
     if not path.is_file():
-        raise ConfigError(f"{path} is not there")
+        raise ConfigError(f"{relative(path)} is not there")
     result: Result = json.loads(path.read_text(encoding="utf-8"))
     return result
 
@@ -268,10 +269,10 @@ def stress(policies: Path) -> str:
         folders = [policies / task, *sorted(path.parent for path in (policies / task).glob(f"seed_*/{STRESS}.json"))]
         tests = [read(folder, STRESS) for folder in folders]
         score, lines = tests[0]["score"], {line["name"]: line["stairs"] for line in tests[0]["lines"]}
-        points = [*(lines[name] for name in chosen), *(tests[0]["ground"][name] for name in NEW_GROUND)]
+        measured = [*(lines[name] for name in chosen), *(tests[0]["ground"][name] for name in NEW_GROUND)]
         scores = [f"{percent(score['value'], 1)} ({percent(score['low'])} to {percent(score['high'])})"]
         scores += [percent(score[part]) for part in ("stairs", "flat", "ground")]
-        failed = [f"{point['robots'] - point['successes']}/{point['robots']}" for point in points]
+        failed = [f"{point['robots'] - point['successes']}/{point['robots']}" for point in measured]
         seeds = ", ".join(percent(test["score"]["value"], 1) for test in tests[1:])
         rows.append([f"`{task}`", *scores, *failed, seeds or "-"])
     head = ("task", "score [%] (95 % interval)", "stairs", "flat", "new ground", *chosen)
