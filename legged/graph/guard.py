@@ -2,13 +2,14 @@
 state.
 """
 
+import inspect
 import re
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Any
 
 import torch
@@ -49,19 +50,13 @@ def calling(term: str) -> Iterator[None]:
         raise TermError(f"{term}: {text[0] if text else type(error).__name__}{_hint(error)}") from error
 
 
-HINTS = {
-    r"\blast_actions\[[^],]*,[^],]*,": "write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for"
-    " last_actions[:, :, 1]",
-    r"\bdefault_dof_pos\[:,": "self.default_dof_pos is (D,); write self.default_dof_pos[indices]",
-}
-"""Pattern of an expression in legged_gym's forks that fails here -> what to write instead."""
-
-
 def _hint(error: Exception) -> str:
-    """Return the end of the message of a TypeError or IndexError whose line matches a pattern of HINTS, else nothing."""
-    lines = " ".join(frame.line or "" for frame in extract_tb(error.__traceback__))
-    hints = [hint for pattern, hint in HINTS.items() if re.search(pattern, lines)]
-    return f"; {hints[0]}" if hints and isinstance(error, IndexError | TypeError) else ""
+    """Return the end of the message of an IndexError in a function that reads a fifth or a later column of commands."""
+    for frame, _ in walk_tb(error.__traceback__ if isinstance(error, IndexError) else None):
+        with suppress(OSError):  # Python does not know the source
+            if re.search(r"\bcommands\[:, ?([4-9]|\d\d)\b", inspect.getsource(frame)):
+                return "; self.commands (N, 4) has vx, vy, yaw rate, heading; keep other commands in a tensor of your own"
+    return ""
 
 
 class ForbidHostReads:

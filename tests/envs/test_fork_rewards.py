@@ -340,14 +340,9 @@ REFUSED = {
     "ids": (write_by_list, "unknown size"),
     "a counter": (count, r"self\.calls changed"),
     "a tensor bound anew": (rebind, "self.last_contact_force"),
-    "actions in a third axis": (
-        lambda task: task.last_actions[:, :, 0].sum(dim=1),
-        "write self.last_actions for last_actions",
-    ),
-    "default angles by robot": (
-        lambda task: task.default_dof_pos[:, [0, 3]].sum(dim=1),
-        r"write self.default_dof_pos\[indices",
-    ),
+    "a fifth column of commands": (lambda task: task.commands[:, 4], "has vx, vy, yaw rate, heading; keep other"),
+    "a slice of columns of commands": (lambda task: task.commands[:, 10:12][:, 1], "keep other commands in a tensor"),
+    "quaternions with w last": (lambda task: get_euler_xyz(task.root_states[:, 3:7])[2], "pass self.base_quat"),
     "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
 }
 
