@@ -62,10 +62,6 @@ def _feet_angles(task: Any) -> list[Tensor]:
     return [angle.view(quat.shape[:2]) for angle in get_euler_xyz(quat.flatten(0, 1))]
 
 
-def _rpy(task: Any) -> Tensor:
-    return torch.stack(get_euler_xyz(task.base_quat), dim=1)
-
-
 def _tiles(task: Any) -> Any:
     """Return the terrain's curriculum."""
     if task.terrain_curriculum is None:
@@ -151,26 +147,18 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
 }
 """Name in legged_gym -> function that returns the value, which the task has under another name. Tensors are not copied."""
 
+_STATE = "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)"
 COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
-    "root_states": (_root_states, "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)"),
-    "dof_state": (
-        lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2),
-        "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)",
-    ),
-    "rpy": (_rpy, "it follows from self.base_quat"),
-    "base_euler_xyz": (_rpy, "it follows from self.base_quat"),
-    "base_height": (
-        lambda task: task.base_pos[:, 2] - task.measured_heights.mean(dim=1),
-        "it follows from self.base_pos and self.measured_heights",
-    ),
+    "root_states": (_root_states, _STATE),
+    "dof_state": (lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2), _STATE),
+    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "it follows from self.base_quat"),
+    "base_euler_xyz": (lambda task: task.rpy, "it follows from self.base_quat"),
+    "base_height": (lambda task: task.base_pos[:, 2] - task.measured_heights.mean(dim=1), "it follows from self.base_pos"),
     "base_lin_acc": (
         lambda task: (task.physics.robot_state.base_lin_vel_w - task.last_root_vel[:, :3]) / task.dt,
         "it follows from self.root_states and self.last_root_vel",
     ),
-    "dof_acc": (
-        lambda task: (task.dof_vel - task.last_dof_vel) / task.dt,
-        "it follows from self.dof_vel and self.last_dof_vel",
-    ),
+    "dof_acc": (lambda task: (task.dof_vel - task.last_dof_vel) / task.dt, "it follows from self.dof_vel"),
     "foot_heights": (_foot_heights, "it follows from self.feet_pos and the ground"),
     "feet_roll": (lambda task: _feet_angles(task)[0], "it follows from self.physics.quantity('xquat')"),
     "feet_yaw": (lambda task: _feet_angles(task)[2], "it follows from self.physics.quantity('xquat')"),
@@ -341,9 +329,7 @@ class LeggedGymNames:
         if name not in ABSENT:
             graph = vars(self).get("_graph")
             if graph is not None and graph.captured:
-                raise AttributeError(
-                    "is stored at each step only if a term reads it; no term had read it when the step was captured"
-                )
+                raise AttributeError("is stored only if a term reads it; none had read it when the step was captured")
             value = (KEPT | SUBSTEPS)[name](self)
             if name in SUBSTEPS:
                 value = value.unsqueeze(1).repeat(1, self.cfg.control.decimation, 1)

@@ -50,12 +50,21 @@ def calling(term: str) -> Iterator[None]:
         raise TermError(f"{term}: {text[0] if text else type(error).__name__}{_hint(error)}") from error
 
 
+HINTS = {
+    r"\bcommands\[:, ?([4-9]|\d\d)\b": "self.commands (N, 4) has vx, vy, yaw rate, heading; keep others in your own tensor",
+    r"\.terrain_heights\(": "self.height_scan.ground_at(points) has heights of the ground; self.base_height is above it",
+    r"\bquat_(conjugate|mul)\(": "legged.math has no products of quaternions; quat_rotate_inverse turns by the conjugate",
+}
+"""Pattern of an expression in legged_gym's forks that fails here -> what to write instead."""
+
+
 def _hint(error: Exception) -> str:
-    """Return the end of the message of an IndexError in a function that reads a fifth or a later column of commands."""
-    for frame, _ in walk_tb(error.__traceback__ if isinstance(error, IndexError) else None):
+    """Return the end of the message of an error in a function that has an expression of HINTS, else nothing."""
+    for frame, _ in walk_tb(error.__traceback__ if isinstance(error, AttributeError | IndexError | NameError) else None):
         with suppress(OSError):  # Python does not know the source
-            if re.search(r"\bcommands\[:, ?([4-9]|\d\d)\b", inspect.getsource(frame)):
-                return "; self.commands (N, 4) has vx, vy, yaw rate, heading; keep other commands in a tensor of your own"
+            source = inspect.getsource(frame)
+            if found := [hint for pattern, hint in HINTS.items() if re.search(pattern, source)]:
+                return f"; {found[0]}"
     return ""
 
 
