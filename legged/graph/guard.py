@@ -64,7 +64,7 @@ def _hint(error: Exception) -> str:
         with suppress(OSError):  # Python does not know the source
             source = inspect.getsource(frame)
             if found := [hint for pattern, hint in HINTS.items() if re.search(pattern, source)]:
-                return f"; {found[0]}"
+                return f"; {'; '.join(found)}"
     return ""
 
 
