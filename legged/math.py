@@ -8,23 +8,30 @@ from torch import Tensor
 from torch.nn.functional import mse_loss, normalize
 
 
+def _w_first(quat: Tensor) -> Tensor:
+    """Return `quat`, unless it is a part of Isaac Gym's `root_states`, whose quaternions have w last."""
+    if getattr(quat, "w_last", False):
+        raise TypeError("the quaternions of self.root_states have w last, those of legged.math first; pass self.base_quat")
+    return quat
+
+
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
     """Rotate vectors `vec` (N, 3) from the body frame of `quat` (N, 4) to the world frame."""
-    w, xyz = quat[:, :1], quat[:, 1:]
+    w, xyz = _w_first(quat).split([1, 3], dim=1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
     """Rotate vectors `vec` (N, 3) from the world frame to the body frame of `quat` (N, 4)."""
-    w, xyz = quat[:, :1], quat[:, 1:]
+    w, xyz = _w_first(quat).split([1, 3], dim=1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
     """Return the rotation matrices (N, 3, 3) from the body frame of `quat` (N, 4), w first, to the world frame."""
-    w, x, y, z = quat.t().contiguous()
+    w, x, y, z = _w_first(quat).t().contiguous()
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
@@ -35,7 +42,7 @@ def quat_to_matrix(quat: Tensor) -> Tensor:
 
 def yaw_of(quat: Tensor) -> Tensor:
     """Return the heading angle of the body's x axis in the world frame, (N,) [rad]."""
-    w, x, y, z = quat.unbind(dim=1)
+    w, x, y, z = _w_first(quat).unbind(dim=1)
     return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
@@ -44,7 +51,7 @@ def get_euler_xyz(quat: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     world's x, y and z axes, in this order. Each angle lies in [-pi, pi]. Isaac Gym differs: its angles lie in [0, 2 pi), and
     its quaternions have w last.
     """
-    w, x, y, z = quat.unbind(dim=1)
+    w, x, y, z = _w_first(quat).unbind(dim=1)
     roll = torch.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = torch.asin((2.0 * (w * y - z * x)).clamp(-1.0, 1.0))
     return roll, pitch, yaw_of(quat)
@@ -54,7 +61,7 @@ def quat_apply_yaw(quat: Tensor, vec: Tensor) -> Tensor:
     """Rotate vectors `vec` (N, 3) about the world's z axis by the turn about z in `quat` (N, 4), w first: by the quaternion
     (w, 0, 0, z), normalised.
     """
-    w, x, y, z = quat.unbind(dim=1)
+    w, x, y, z = _w_first(quat).unbind(dim=1)
     turn = normalize(torch.stack([w, torch.zeros_like(x), torch.zeros_like(y), z], dim=1), dim=1)
     return quat_rotate(turn, vec)
 

@@ -18,7 +18,7 @@ from legged.commandline.command import run_main
 from legged.errors import ConfigError
 from legged.play.films import Film, film, walker, write_film
 from legged.policies.restore import TrainedPolicy, policy_of
-from legged.process.command_parser import IMPORT, CommandParser
+from legged.process.command_parser import IMPORT, CommandParser, check_between, check_number
 from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
 from legged.rendering.camera import INK
@@ -57,10 +57,8 @@ def _main(argv: list[str] | None) -> int:
     if args.out.is_dir():
         raise ConfigError(f"--out: {args.out} is a folder; expected a file")
     ready_to_write(args.out.parent, 4.0)
-    if args.columns is not None and args.columns < 1:
-        raise ConfigError(f"--columns: must be at least 1, got {args.columns}")
-    if not SMALLEST <= args.side <= LARGEST:
-        raise ConfigError(f"--side: must be between {SMALLEST} and {LARGEST}, got {args.side}")
+    check_number("--columns", args.columns, 1)
+    check_between("--side", args.side, SMALLEST, LARGEST)
     if args.module:
         import_tasks(args.module)
     policies = [policy_of(name, where="TASK | RUN") for name in args.robots]

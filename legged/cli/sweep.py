@@ -27,7 +27,7 @@ from legged.learning.runner import Runner
 from legged.process.command_parser import IMPORT, argument, check_number
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
-from legged.process.processes import Job, Kind, WorkerPool, why_failed
+from legged.process.processes import Job, WorkerPool, why_failed
 from legged.process.ranks import Ranks
 from legged.sweeping.plan import Plan, plan_sweep, sweep_file
 from legged.sweeping.trials import RUNS, WHY, Trials, repeating, write_report
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -> list[int]:
     """Run trials in `jobs` worker processes; return the signals that this process received."""
     given, start, starts = trials.plan.given, time.perf_counter(), [0] * jobs
-    pool = WorkerPool({Kind.TRAINING: jobs})
+    pool = WorkerPool(jobs)
     told = {trial.number for trial in trials.finished}
 
     def say(text: str) -> None:
@@ -145,7 +145,7 @@ def _pool(trials: Trials, arguments: list[str], devices: list[str], jobs: int) -
         words = [sys.executable, "-m", "legged", "sweep", "run", *arguments, "--worker", str(number), "--jobs", str(jobs)]
         words += ["--sim-device", devices[number % len(devices)], "--trials", str(given.trials)]
         output = trials.plan.folder / "output" / f"worker{number}.txt"
-        return Job(Kind.TRAINING, words, output, lambda ended, code: done(number, ended, code))
+        return Job(words, output, lambda ended, code: done(number, ended, code))
 
     def done(number: int, ended: Job, code: int) -> list[Job]:
         if code == 0 or pool.stopped:

@@ -1,12 +1,13 @@
 """Base class of a configuration's sections, which can be read as those of legged_gym's forks."""
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 from legged.config.origins import Origins
 from legged.errors import suggest
 
 
+@dataclass(frozen=True)
 class Section:
     """A configuration or one of its sections. `cfg.rewards.name` is the number `custom.name` if the section has no setting of
     that name. `cfg["rewards"]` is `cfg.rewards`.

@@ -10,6 +10,9 @@ from legged.config.origins import Origins
 from legged.config.section import Section
 from legged.config.world import EnvConfig, SimConfig
 
+OF_FORKS = ("asset", "normalization", "noise")
+"""Sections of legged_gym that have no settings here. They can be read, and hold the numbers of `custom`."""
+
 
 @dataclass(frozen=True)
 class TaskConfig(Section):
@@ -39,10 +42,12 @@ class TaskConfig(Section):
     """Sources of the settings. `compare=False` marks that this field is not a setting, so files neither set nor store it."""
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if isinstance(getattr(self, f.name), Section)):
-            section = replace(getattr(self, name))  # another configuration may hold the same section
-            object.__setattr__(section, "_custom", (self.custom, name, self.origins))
-            object.__setattr__(self, name, section)
+        sections = {f.name: getattr(self, f.name) for f in fields(self)} | dict.fromkeys(OF_FORKS, Section())
+        for name, held in sections.items():
+            if isinstance(held, Section):
+                section = replace(held)  # another configuration may hold the same section
+                object.__setattr__(section, "_custom", (self.custom, name, self.origins))
+                object.__setattr__(self, name, section)
 
     def trained(self) -> Self:
         """Return the configuration for play and evaluation of a trained policy. Domain randomisation is off, and the settings

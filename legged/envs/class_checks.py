@@ -154,13 +154,13 @@ def never_called(name: str) -> str:
 def _names(member: Any, name: str) -> bool:
     """Return whether the code of a method uses `name`. A member without code counts as one that does."""
     code = getattr(inspect.unwrap(member), "__code__", None)
-    return code is None or name in _names_in(code)
+    return code is None or name in names_in(code)
 
 
-def _names_in(code: CodeType) -> set[str]:
+def names_in(code: CodeType) -> set[str]:
     """Return the names of the attributes and globals that a function or its nested functions use."""
     within = [constant for constant in code.co_consts if isinstance(constant, CodeType)]
-    return set(code.co_names).union(*(_names_in(constant) for constant in within))
+    return set(code.co_names).union(*(names_in(constant) for constant in within))
 
 
 def _constructor_fault(constructor: Any) -> str:

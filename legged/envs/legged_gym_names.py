@@ -5,55 +5,18 @@ These attributes cost nothing until they are read. If a class sets an attribute 
 """
 
 import difflib
+import inspect
 from collections.abc import Callable
 from types import MappingProxyType, SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from legged.envs.class_checks import names_in
+from legged.envs.views import ReadOnly
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
 from legged.robots.stance import lowest_point, stance
-
-FORWARD, DOWN, LEVEL = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 1.0)
-"""Unit vectors of the x axis and of gravity, and the identity orientation (x, y, z, w)."""
-IN_PLACE = {f"__i{name}__" for name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "and", "or", "xor")}
-
-
-class ReadOnly(Tensor):
-    """Value of an attribute that is computed at each reading. Writing to this tensor or to a view of it would not change the
-    task, so it raises an AttributeError that names an alternative. Results computed from the tensor are ordinary tensors.
-    """
-
-    instead: str = ""
-
-    @classmethod
-    def of(cls, tensor: Tensor, instead: str) -> "ReadOnly":
-        """Return a read-only view of `tensor`. An attempt to write raises an AttributeError with the text `instead`."""
-        result = tensor.as_subclass(cls)
-        result.instead = instead
-        return result
-
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        kwargs = kwargs or {}
-        name = getattr(func, "__name__", "")
-        writes = name == "__setitem__" or name in IN_PLACE or (name.endswith("_") and not name.endswith("__"))
-        first = args[0] if args else None
-        for target in (first if writes else None, kwargs.get("out")):
-            if isinstance(target, cls):
-                raise AttributeError(target.instead)
-        with torch._C.DisableTorchFunctionSubclass():
-            result = func(*args, **kwargs)
-            if isinstance(first, cls) and type(result) is Tensor and _share(first, result):
-                return cls.of(result, first.instead)
-        return result
-
-
-def _share(one: Tensor, other: Tensor) -> bool:
-    """Return whether two tensors share memory."""
-    strided = one.layout is other.layout is torch.strided
-    return strided and one.untyped_storage()._cdata == other.untyped_storage()._cdata
 
 
 def _root_states(task: Any) -> Tensor:
@@ -91,31 +54,19 @@ def _feet_bodies(task: Any) -> Tensor:
     return torch.tensor(bodies, device=task.device)
 
 
-def _feet_angle(axis: int) -> Callable[[Any], Tensor]:
-    """Return a function that computes the feet's roll (`axis` 0) or yaw (2), (N, F) [rad]."""
-
-    def read(task: Any) -> Tensor:
-        if "xquat" not in task.QUANTITIES:
-            raise AttributeError("needs the orientations of bodies; write QUANTITIES = ('xquat',) in the class")
-        quat = task.physics.quantity("xquat").index_select(1, _once(task, "feet_bodies", _feet_bodies))
-        return get_euler_xyz(quat.flatten(0, 1))[axis].view(quat.shape[:2])
-
-    return read
+def _feet_angles(task: Any) -> list[Tensor]:
+    """Return roll, pitch and yaw of the feet's bodies, (N, F) each [rad]."""
+    if "xquat" not in task.QUANTITIES:
+        raise AttributeError("needs the orientations of bodies; write QUANTITIES = ('xquat',) in the class")
+    quat = task.physics.quantity("xquat").index_select(1, _once(task, "feet_bodies", _feet_bodies))
+    return [angle.view(quat.shape[:2]) for angle in get_euler_xyz(quat.flatten(0, 1))]
 
 
-def _rpy(task: Any) -> Tensor:
-    return torch.stack(get_euler_xyz(task.base_quat), dim=1)
-
-
-def _of_terrain(get: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Wrap `get` so that it raises an AttributeError if the task has no terrain."""
-
-    def read(task: Any) -> Any:
-        if task.terrain_curriculum is None:
-            raise AttributeError("the ground is a plane (terrain.mesh_type) and has no tiles")
-        return get(task)
-
-    return read
+def _tiles(task: Any) -> Any:
+    """Return the terrain's curriculum."""
+    if task.terrain_curriculum is None:
+        raise AttributeError("the ground is a plane (terrain.mesh_type) and has no tiles")
+    return task.terrain_curriculum
 
 
 def _friction(task: Any) -> Tensor:
@@ -123,6 +74,12 @@ def _friction(task: Any) -> Tensor:
     if "friction" not in drawn:
         raise AttributeError("friction is not randomised (domain_rand.randomize_friction is off)")
     return drawn["friction"].view(-1, 1, 1)
+
+
+def _beyond_limits(task: Any) -> Tensor:
+    """Return (N, D) how far the joints are beyond their soft limits [rad]."""
+    low, high = task.dof_pos_limits.unbind(dim=1)
+    return torch.maximum(low - task.dof_pos, task.dof_pos - high).clamp(min=0.0)
 
 
 def _joint_pos_target(task: Any) -> Tensor:
@@ -184,49 +141,41 @@ PLAIN: dict[str, Callable[[Any], Any]] = {
     "foot_positions": lambda task: task.feet_pos,
     "foot_velocities": lambda task: task.feet_vel,
     "friction_coeffs": _friction,
-    "max_terrain_level": _of_terrain(lambda task: task.terrain_curriculum.rows),
-    "terrain_levels": _of_terrain(lambda task: task.terrain_curriculum.levels),
-    "terrain_types": _of_terrain(lambda task: task.terrain_curriculum.columns),
+    "max_terrain_level": lambda task: _tiles(task).rows,
+    "terrain_levels": lambda task: _tiles(task).levels,
+    "terrain_types": lambda task: _tiles(task).columns,
 }
 """Name in legged_gym -> function that returns the value, which the task has under another name. Tensors are not copied."""
 
+_STATE = "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)"
 COMPUTED: dict[str, tuple[Callable[[Any], Tensor], str]] = {
-    "root_states": (_root_states, "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)"),
-    "dof_state": (
-        lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2),
-        "to set a state, call self.physics.write(mask, qpos, qvel) in reset_idx(mask)",
-    ),
-    "rpy": (_rpy, "it follows from self.base_quat"),
-    "base_euler_xyz": (_rpy, "it follows from self.base_quat"),
-    "base_height": (
-        lambda task: task.base_pos[:, 2] - task.measured_heights.mean(dim=1),
-        "it follows from self.base_pos and self.measured_heights",
-    ),
+    "root_states": (_root_states, _STATE),
+    "dof_state": (lambda task: torch.stack([task.dof_pos, task.dof_vel], dim=2).view(-1, 2), _STATE),
+    "rpy": (lambda task: torch.stack(get_euler_xyz(task.base_quat), dim=1), "it follows from self.base_quat"),
+    "base_euler_xyz": (lambda task: task.rpy, "it follows from self.base_quat"),
+    "base_height": (lambda task: task.base_pos[:, 2] - task.measured_heights.mean(dim=1), "it follows from self.base_pos"),
     "base_lin_acc": (
         lambda task: (task.physics.robot_state.base_lin_vel_w - task.last_root_vel[:, :3]) / task.dt,
         "it follows from self.root_states and self.last_root_vel",
     ),
-    "dof_acc": (
-        lambda task: (task.dof_vel - task.last_dof_vel) / task.dt,
-        "it follows from self.dof_vel and self.last_dof_vel",
-    ),
+    "dof_acc": (lambda task: (task.dof_vel - task.last_dof_vel) / task.dt, "it follows from self.dof_vel"),
     "foot_heights": (_foot_heights, "it follows from self.feet_pos and the ground"),
-    "feet_roll": (_feet_angle(0), "it follows from self.physics.quantity('xquat')"),
-    "feet_yaw": (_feet_angle(2), "it follows from self.physics.quantity('xquat')"),
+    "feet_roll": (lambda task: _feet_angles(task)[0], "it follows from self.physics.quantity('xquat')"),
+    "feet_yaw": (lambda task: _feet_angles(task)[2], "it follows from self.physics.quantity('xquat')"),
     "joint_pos_target": (_joint_pos_target, "self.control computes it from the actions"),
 }
 """Name in legged_gym -> function that computes the value at each reading, and a hint for users who try to write to it."""
 
 CONSTANT: dict[str, Callable[[Any], Tensor]] = {
-    "gravity_vec": lambda task: torch.tensor([DOWN], device=task.device).repeat(task.num_envs, 1),
-    "forward_vec": lambda task: torch.tensor([FORWARD], device=task.device).repeat(task.num_envs, 1),
+    "gravity_vec": lambda task: torch.tensor([[0.0, 0.0, -1.0]], device=task.device).repeat(task.num_envs, 1),
+    "forward_vec": lambda task: torch.tensor([[1.0, 0.0, 0.0]], device=task.device).repeat(task.num_envs, 1),
     "base_init_state": lambda task: torch.tensor(
-        [0.0, 0.0, task.robot.file.spawn_height, *LEVEL, *(0.0,) * 6], device=task.device
+        [0.0, 0.0, task.robot.file.spawn_height, 0.0, 0.0, 0.0, 1.0, *[0.0] * 6], device=task.device
     ),
     "commands_scale": lambda task: torch.tensor(task.observation_scales()["commands"], device=task.device),
     "noise_scale_vec": _noise_scale_vec,
     "height_points": lambda task: torch.nn.functional.pad(task.height_scan.points, (0, 1)).repeat(task.num_envs, 1, 1),
-    "terrain_origins": _of_terrain(lambda task: torch.tensor(task.terrain.origins, dtype=torch.float32, device=task.device)),
+    "terrain_origins": lambda task: _tiles(task).tiles.view(_tiles(task).rows, -1, 3),
 }
 """Name in legged_gym -> function that makes a constant at the first reading."""
 
@@ -242,82 +191,61 @@ KEPT: dict[str, Callable[[Any], Tensor]] = {
     "last_last_actions": lambda task: task.last_actions,
     "last_joint_pos_target": _joint_pos_target,
     "last_last_joint_pos_target": lambda task: task.last_joint_pos_target,
+    "rwd_linVelTrackPrev": lambda task: task._reward_tracking_lin_vel(),
+    "rwd_angVelTrackPrev": lambda task: task._reward_tracking_ang_vel(),
 }
 """Name in legged_gym -> function. If a term reads the name, each step stores the function's value for the next step. So a
 reward may count in `feet_air_time` or assign `last_contacts`, as legged_gym's do: the next step starts from the true values.
 """
 
-_COUNT = "count in your own tensor: allocate it in _init_buffers(), and let the hook advance() increment it in place"
-_GYM = "there is no Isaac Gym: self.physics makes the steps; to change a step, override the hooks that _step() calls"
-_INDICES = "self.joints('hip') has the indices of the joints whose names contain 'hip'; other patterns work alike"
+SUBSTEPS: dict[str, Callable[[Any], Tensor]] = {
+    "substep_torques": lambda task: task.torques,
+    "substep_dof_vel": lambda task: task.dof_vel,
+    "substep_exceed_dof_pos_limits": lambda task: _beyond_limits(task) > 0.0,
+    "substep_exceed_dof_pos_limit_abs": _beyond_limits,
+}
+"""Name in forks of legged_gym -> function. If a term reads the name, the values after each physics step are stored."""
+
 _BODIES = (
     "self.feet_pos and self.feet_vel (N, F, 3) hold the states of the feet; for all bodies, the class attribute"
     " QUANTITIES = ('xpos', 'xquat', 'cvel') makes them readable by self.physics.quantity(name)"
 )
-_ANGLES = "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]"
-_SUBSTEPS = (
-    "self.torques and self.dof_vel are those of the last physics step; for others, override apply_control(), which runs"
-    " before each physics step: call super().apply_control(), and write into a tensor of your own in place"
-)
 _OWN = "allocate your own tensors in _init_buffers(), and write them in place in advance()"
-_HISTORY = "observations.groups.<group>.history in the YAML is the number of steps that a group holds"
-_PICTURES = "nothing is drawn while training; play.py makes pictures (legged/rendering)"
 
 
 def _drawn(name: str) -> str:
     return f"self.randomization.fields['{name}'] has the values that domain_rand.ranges.{name} draws (docs/randomisation.md)"
 
 
-ABSENT = {
-    "common_step_counter": _COUNT,
-    "gym": _GYM,
-    "sim": _GYM,
-    "viewer": _GYM,
-    "envs": _GYM,
-    "actor_handles": _GYM,
+HINTS = {
+    "common_step_counter command_counter global_counter": "count in your own tensor: allocate it in _init_buffers(), and let"
+    " the hook advance() increment it in place",
+    "gym sim viewer envs actor_handles": "there is no Isaac Gym: self.physics makes the steps; to change a step, override the"
+    " hooks that _step() calls",
     "sim_params": "self.cfg.sim.dt is the physics step, self.dt the control step",
     "extras": "write a method _metric_<name> for each figure to be logged; step() returns its own extras",
-    "rigid_body_states": _BODIES,
-    "rigid_body_state": _BODIES,
-    "rigid_body_pos": _BODIES,
+    "rigid_body_states rigid_body_state rigid_body_pos rigid_state rb_states": _BODIES,
     "height_samples": "self.measured_heights (N, P) are heights around each robot; self.terrain.height_map has all heights",
-    "rigid_state": _BODIES,
-    "rb_states": _BODIES,
-    "hip_indices": _INDICES,
-    "knee_indices": _INDICES,
-    "thigh_indices": _INDICES,
-    "calf_indices": _INDICES,
-    "command_counter": _COUNT,
-    "global_counter": _COUNT,
-    "roll": _ANGLES,
-    "pitch": _ANGLES,
-    "yaw": _ANGLES,
+    "hip_indices front_hip_indices rear_hip_indices knee_indices thigh_indices calf_indices": "self.joints('hip') has the"
+    " indices of the joints whose names contain 'hip'; other patterns work alike",
+    "roll pitch yaw": "self.rpy (N, 3) has roll, pitch and yaw, each in [-pi, pi]",
     "foot_indices": f"self.feet_indices are indices of shapes; for the phases of a gait, {_OWN}",
-    "substep_torques": _SUBSTEPS,
-    "substep_dof_vel": _SUBSTEPS,
-    "substep_exceed_dof_pos_limits": _SUBSTEPS,
-    "substep_exceed_dof_pos_limit_abs": _SUBSTEPS,
     "first_contact": "self.contacts.first_contact (N, F) is True for the feet that touch down at this step",
-    "obs_history": _HISTORY,
-    "obs_history_buf": _HISTORY,
-    "env_frictions": _drawn("friction"),
-    "friction_coeffs_tensor": _drawn("friction"),
+    "obs_history obs_history_buf": "observations.groups.<group>.history in the YAML is the number of steps in a group",
+    "env_frictions friction_coeffs_tensor": _drawn("friction"),
     "restitutions": _drawn("restitution"),
-    "payload": _drawn("added_base_mass"),
-    "payloads": _drawn("added_base_mass"),
-    "com_displacement": _drawn("base_com_x"),
-    "com_displacements": _drawn("base_com_x"),
-    "motor_strength": _drawn("motor_strength"),
-    "motor_strengths": _drawn("motor_strength"),
+    "payload payloads": _drawn("added_base_mass"),
+    "com_displacement com_displacements": _drawn("base_com_x"),
+    "motor_strength motor_strengths": _drawn("motor_strength"),
     "motor_offsets": _drawn("joint_offset"),
     "Kp_factors": _drawn("p_gain"),
     "Kd_factors": _drawn("d_gain"),
-    "headless": _PICTURES,
-    "debug_viz": _PICTURES,
+    "headless debug_viz": "nothing is drawn while training; play.py makes pictures (legged/rendering)",
     "init_done": "the hooks that a step calls always find the tensors that _init_buffers() allocated",
 }
-"""Name in legged_gym or its forks that does not exist here -> hint at its replacement."""
-NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *ABSENT}
+"""Names in legged_gym or its forks that do not exist here -> hint at their replacement."""
+ABSENT = {name: hint for names, hint in HINTS.items() for name in names.split()}
+NAMES = {*PLAIN, *COMPUTED, *CONSTANT, *KEPT, *SUBSTEPS, *ABSENT}
 
 
 class LeggedGymNames:
@@ -330,12 +258,25 @@ class LeggedGymNames:
     `base_height` (N,) is the base's height above the mean of the scanned ground [m]. `base_lin_acc` (N, 3) in the world frame
     [m/s^2] and `dof_acc` (N, D) [rad/s^2] are changes over the control step, divided by its length. `foot_heights` (N, F) are
     heights of soles above the ground under the feet's centres, clipped to [0, 1] m; a sole is as far below the centre as in
-    the default pose. `feet_roll` and `feet_yaw` (N, F) are angles of the feet's bodies [rad]. `friction_coeffs` is (N, 1, 1),
+    the default pose. `feet_roll` and `feet_yaw` (N, F) are angles of the feet's bodies [rad]. `substep_torques` (N, S, D)
+    [N m] and its like have a row for each of the S physics steps of this control step, oldest first: torques during it,
+    velocities [rad/s] and angles beyond soft limits [rad] after it. `rwd_linVelTrackPrev` and `rwd_angVelTrackPrev` (N,) are
+    the tracking rewards before this step, for the same commands. `friction_coeffs` is (N, 1, 1),
     `height_points` (N, P, 3) in the yaw frame [m], `terrain_origins` (rows, columns, 3). `noise_scale_vec` has a number for
     each column of the actor's observations. All other names have the shapes and units of their counterparts in this package.
     """
 
+    QUANTITIES: ClassVar[tuple[str, ...]]
+    cfg: Any
     reset_buf: Tensor
+
+    def __init_subclass__(cls) -> None:
+        """Add the quantities that methods of the class need to `QUANTITIES`."""
+        super().__init_subclass__()
+        code = [getattr(inspect.unwrap(member), "__code__", None) for member in vars(cls).values()]
+        read = set().union(*(names_in(own) for own in code if own is not None))
+        if read & {"feet_roll", "feet_yaw"} and "xquat" not in cls.QUANTITIES:
+            cls.QUANTITIES = (*cls.QUANTITIES, "xquat")
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in vars(self).get("_kept_names", ()):  # a graph goes on reading the tensor that it recorded
@@ -366,11 +307,11 @@ class LeggedGymNames:
             return one[:1] == other[:1] and difflib.SequenceMatcher(None, one, other).ratio() > 0.6
 
         words = name.split("_")
-        known = {*vars(self), *PLAIN, *COMPUTED, *CONSTANT, *KEPT}
+        known = {*vars(self), *NAMES} - {*ABSENT}
         public = [other for other in sorted(known) if other[:1] != "_" and other.count("_") == len(words) - 1]
         likely = [other for other in public if all(map(alike, words, other.split("_")))]
         near = difflib.get_close_matches(name, likely, n=len(likely) or 1, cutoff=0.75)
-        return next((other for other in near if other in KEPT or hasattr(self, other)), None)
+        return next((other for other in near if other in (*KEPT, *SUBSTEPS) or hasattr(self, other)), None)
 
     def _by_their_name(self, name: str) -> Any:
         """Return the value of legged_gym's attribute `name`.
@@ -385,21 +326,29 @@ class LeggedGymNames:
             return ReadOnly.of(compute(self), f"self.{name} is computed when it is read, and cannot be written: {instead}")
         if name in CONSTANT:
             return _once(self, name, CONSTANT[name])
-        if name in KEPT:
+        if name not in ABSENT:
             graph = vars(self).get("_graph")
             if graph is not None and graph.captured:
-                raise AttributeError(
-                    "is stored at each step only if a term reads it; no term had read it when the step was captured"
-                )
-            kept = torch.zeros_like(KEPT[name](self), memory_format=torch.contiguous_format)
-            vars(self)[name] = kept
+                raise AttributeError("is stored only if a term reads it; none had read it when the step was captured")
+            value = (KEPT | SUBSTEPS)[name](self)
+            if name in SUBSTEPS:
+                value = value.unsqueeze(1).repeat(1, self.cfg.control.decimation, 1)
+            vars(self)[name] = kept = torch.zeros_like(value, memory_format=torch.contiguous_format)
             vars(self).setdefault("_kept_names", []).append(name)
             return kept
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
+    def store_substep(self) -> None:
+        """Append the values of names in `SUBSTEPS` that a term has read, and drop those of the oldest physics step."""
+        for name in vars(self).get("_kept_names", ()):
+            if name in SUBSTEPS:
+                kept = vars(self)[name]
+                kept.copy_(kept.roll(-1, dims=1))
+                kept[:, -1].copy_(SUBSTEPS[name](self))
+
     def remember(self) -> None:
         """Store values of names in `KEPT` that a term has read, before BaseTask's `remember` overwrites `last_actions`."""
-        kept = list(vars(self).get("_kept_names", ()))
+        kept = [name for name in vars(self).get("_kept_names", ()) if name in KEPT]
         older = [name for name in kept if name.startswith("last_last_")]
         for name in sorted(kept, key=lambda name: name not in older):  # they read values that the others overwrite
             vars(self)[name].copy_(KEPT[name](self))

@@ -14,6 +14,7 @@ from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.terms import Terms
+from legged.envs.views import Wide
 from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.actuator import with_rotors
 from legged.mdp.command_curriculum import CommandCurriculum
@@ -114,7 +115,10 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
         self._vary_control()
-        self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
+        self.torques, default = self.control.torques, self.control.default_dof_pos
+        self.default_dof_pos = Wide.of(default, lambda: default.unsqueeze(0))
+        last = self.last_actions
+        self.last_actions = Wide.of(last, lambda: torch.stack([last, self.last_last_actions], dim=2))
         self.command_sampler = Commands(cfg.commands, n, self.dt, device, kernels, self.numbers)
         self.commands, self.is_moving = self.command_sampler.commands, self.command_sampler.is_moving
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels, contact_force(robot.mass))
@@ -215,6 +219,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
         self.control.set_actions(self.actions)
 
     def apply_control(self) -> None:
+        self.store_substep()
         self.control.compute(self.dof_pos, self.dof_vel)
 
     def draw(self) -> None:
@@ -246,6 +251,7 @@ class LeggedRobot(Terms, LeggedGymNames, BaseTask):
 
     def advance(self) -> None:
         super().advance()
+        self.store_substep()
         self.contacts.update(self.contact_forces[:, self._feet_shapes])
 
     def update_curricula(self) -> None:

@@ -2,13 +2,14 @@
 state.
 """
 
+import inspect
 import re
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from traceback import extract_tb
+from traceback import walk_tb
 from typing import Any
 
 import torch
@@ -50,18 +51,21 @@ def calling(term: str) -> Iterator[None]:
 
 
 HINTS = {
-    r"\blast_actions\[[^],]*,[^],]*,": "write self.last_actions for last_actions[:, :, 0], and self.last_last_actions for"
-    " last_actions[:, :, 1]",
-    r"\bdefault_dof_pos\[:,": "self.default_dof_pos is (D,); write self.default_dof_pos[indices]",
+    r"\bcommands\[:, ?([4-9]|\d\d)\b": "self.commands (N, 4) has vx, vy, yaw rate, heading; keep others in your own tensor",
+    r"\.terrain_heights\(": "self.height_scan.ground_at(points) has heights of the ground; self.base_height is above it",
+    r"\bquat_(conjugate|mul)\(": "legged.math has no products of quaternions; quat_rotate_inverse turns by the conjugate",
 }
 """Pattern of an expression in legged_gym's forks that fails here -> what to write instead."""
 
 
 def _hint(error: Exception) -> str:
-    """Return the end of the message of a TypeError or IndexError whose line matches a pattern of HINTS, else nothing."""
-    lines = " ".join(frame.line or "" for frame in extract_tb(error.__traceback__))
-    hints = [hint for pattern, hint in HINTS.items() if re.search(pattern, lines)]
-    return f"; {hints[0]}" if hints and isinstance(error, IndexError | TypeError) else ""
+    """Return the end of the message of an error in a function that has an expression of HINTS, else nothing."""
+    for frame, _ in walk_tb(error.__traceback__ if isinstance(error, AttributeError | IndexError | NameError) else None):
+        with suppress(OSError):  # Python does not know the source
+            source = inspect.getsource(frame)
+            if found := [hint for pattern, hint in HINTS.items() if re.search(pattern, source)]:
+                return f"; {'; '.join(found)}"
+    return ""
 
 
 class ForbidHostReads:

@@ -58,7 +58,8 @@ class TerrainCurriculum:
         self.names = terrain.type_names
         kinds = torch.tensor([self.names.index(name) for name in terrain.types], device=device)
         self._of_type = torch.nn.functional.one_hot(kinds[self.columns], len(self.names)).t().float()  # (K, N) for K types
-        self._tiles = torch.tensor(terrain.origins, dtype=torch.float32, device=device).flatten(0, 1)
+        self.tiles = torch.tensor(terrain.origins, dtype=torch.float32, device=device).flatten(0, 1)
+        """(rows * columns, 3) middle of each tile, world frame [m]."""
         self._count = columns
         self._far = 0.5 * min(terrain.tile_size)
         self._random = torch.zeros_like(self.levels)
@@ -94,7 +95,7 @@ class TerrainCurriculum:
         if self._kernels is not None:
             judged = torch.empty(3, len(ended), device=ended.device)
             step = (ended, valid, commands, base_lin_vel, steps_left, self.dt)
-            tiles = (self.rows, self._count, self._random, self.columns, self._tiles)
+            tiles = (self.rows, self._count, self._random, self.columns, self.tiles)
             self._kernels.move_levels(
                 *step, self._far, PROMOTED, DEMOTED, *tiles, self.way, self.levels, self.origins, judged
             )
@@ -122,7 +123,7 @@ class TerrainCurriculum:
         self._place()
 
     def _place(self) -> None:
-        torch.index_select(self._tiles, 0, self.levels * self._count + self.columns, out=self.origins)
+        torch.index_select(self.tiles, 0, self.levels * self._count + self.columns, out=self.origins)
 
     def metrics(self) -> dict[str, Tensor]:
         """Return new 0-dimensional tensors by name in TensorBoard: the mean level, and for each terrain type the mean level

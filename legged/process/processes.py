@@ -1,4 +1,4 @@
-"""Child processes: their environment, and a pool that runs them in parallel with a limit for each kind of work."""
+"""Child processes: their environment, and a pool that runs several of them in parallel."""
 
 import os
 import signal
@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen
 
@@ -33,19 +32,10 @@ def child_environment() -> dict[str, str]:
     return environment
 
 
-class Kind(Enum):
-    """Kind of work of a process. Each kind has a limit on how many processes run at once."""
-
-    TRAINING = "training"
-    ON_GPU = "evaluation on the GPU"
-    ON_CORES = "evaluation on the cores"
-
-
 @dataclass(eq=False)
 class Job:
     """A process that the pool will run."""
 
-    kind: Kind
     command: list[str]
     output: Path
     """File for the process's standard output and errors."""
@@ -85,13 +75,13 @@ class Job:
 class WorkerPool:
     """Pool that runs jobs until the queue is empty. A job that fails does not end the others.
 
-    Trainings start in the order of the queue. Each starts when the previous training has built its task, so that start-up
-    overlaps with training and no kernel is compiled twice. Jobs of a kind in `shared` wait until every training has ended.
+    Jobs are trainings. They start in the order of the queue, each when the previous training has built its task, so that
+    start-up overlaps with training and no kernel is compiled twice.
     """
 
-    def __init__(self, room: dict[Kind, int], shared: tuple[Kind, ...] = ()) -> None:
-        """Build a pool. `room` is the largest number of running jobs of each kind; `shared` kinds wait for all trainings."""
-        self.room, self.shared = room, shared
+    def __init__(self, room: int) -> None:
+        """Build a pool. `room` is the largest number of running jobs."""
+        self.room = room
         self.waiting: list[Job] = []
         self.running: list[Job] = []
         self.stopped = False
@@ -101,11 +91,11 @@ class WorkerPool:
         self.waiting += jobs
         try:
             while self.running or (self.waiting and not self.stopped):
-                for job in [] if self.stopped else [*self.waiting]:
-                    if self._may_start(job):
-                        self.waiting.remove(job)
-                        job.start()
-                        self.running.append(job)
+                has_room = len(self.running) < self.room and not any(job.starting for job in self.running)
+                if self.waiting and has_room and not self.stopped:
+                    job = self.waiting.pop(0)
+                    job.start()
+                    self.running.append(job)
                 time.sleep(POLL_S)
                 for job in [*self.running]:
                     if self.stopped and not job.told:
@@ -122,15 +112,6 @@ class WorkerPool:
     def stop(self) -> None:
         """Start no more jobs and ask the running ones to end. A signal handler may call this."""
         self.stopped = True
-
-    def _may_start(self, job: Job) -> bool:
-        same = [other for other in self.running if other.kind is job.kind]
-        if len(same) >= self.room[job.kind]:
-            return False
-        if job.kind is Kind.TRAINING:
-            return not any(other.starting for other in same)
-        trainings = any(other.kind is Kind.TRAINING for other in (*self.running, *self.waiting))
-        return not (job.kind in self.shared and trainings)
 
     def _end_at_once(self) -> None:
         for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGKILL):

@@ -46,6 +46,22 @@ class Fork(LeggedRobot):
     def _reward_joint_power(self):
         return torch.sum(torch.abs(self.dof_vel) * torch.abs(self.torques), dim=1)
 
+    def _reward_power_of_substeps(self):
+        return torch.mean(torch.sum(torch.square(self.substep_torques * self.substep_dof_vel), dim=-1), dim=-1)
+
+    def _reward_exceeded_substeps(self):
+        return self.substep_exceed_dof_pos_limits.to(torch.float32).sum(dim=-1).mean(dim=-1)
+
+    def _reward_smoothness_by_axis(self):
+        change = self.actions - 2 * self.last_actions[:, :, 0] + self.last_actions[:, :, 1]
+        return torch.sum(torch.square(change), dim=1)
+
+    def _reward_hips_by_axis(self):
+        return torch.sum(torch.square(self.dof_pos[:, self.hip_ids] - self.default_dof_pos[:, self.hip_ids]), dim=1)
+
+    def _reward_better_tracking(self):
+        return ~self.reset_buf * (self._reward_tracking_lin_vel() - self.rwd_linVelTrackPrev) / self.dt
+
     def _reward_power_distribution(self):
         return torch.var(torch.abs(self.torques * self.dof_vel), dim=1)
 
@@ -229,6 +245,7 @@ SAME = {
     "collisions": "collision",
     "joint_limits": "dof_pos_limits",
     "stumbles": "stumble",
+    "smoothness_by_axis": "smoothness",
 }
 
 
@@ -268,6 +285,7 @@ def test_own_numbers_of_rewards_are_those_of_custom():
 def test_own_numbers_of_other_sections_and_in_brackets_are_found_too():
     cfg = small_config(("custom", {"selected": "hurdle"}))
     assert cfg.terrain.selected == cfg.commands.selected == cfg["env"]["selected"] == "hurdle"
+    assert cfg.asset.selected == cfg.normalization.selected == "hurdle"  # sections that have no settings here
     assert cfg["rewards"]["tracking_sigma"] == cfg.rewards.tracking_sigma
     with pytest.raises(AttributeError, match=r"custom has no 'selecte', and neither has terrain; did you mean 'selected'\?"):
         cfg.terrain.selecte  # noqa: B018
@@ -340,14 +358,10 @@ REFUSED = {
     "ids": (write_by_list, "unknown size"),
     "a counter": (count, r"self\.calls changed"),
     "a tensor bound anew": (rebind, "self.last_contact_force"),
-    "actions in a third axis": (
-        lambda task: task.last_actions[:, :, 0].sum(dim=1),
-        "write self.last_actions for last_actions",
-    ),
-    "default angles by robot": (
-        lambda task: task.default_dof_pos[:, [0, 3]].sum(dim=1),
-        r"write self.default_dof_pos\[indices",
-    ),
+    "a fifth column of commands": (lambda task: task.commands[:, 4], "has vx, vy, yaw rate, heading; keep others"),
+    "a slice of columns of commands": (lambda task: task.commands[:, 10:12][:, 1], "keep others in your own tensor"),
+    "heights at points": (lambda task: task.terrain.terrain_heights(task.base_pos), r"self.height_scan.ground_at\(points\)"),
+    "quaternions with w last": (lambda task: get_euler_xyz(task.root_states[:, 3:7])[2], "pass self.base_quat"),
     "Isaac Gym": (lambda task: task.gym.refresh_rigid_body_state_tensor(task.sim), "there is no Isaac Gym"),
 }
 

@@ -10,7 +10,8 @@ from helpers import CALM, ENGINE, JOINTS, small_config, small_task, zero_actions
 from torch import Tensor
 
 from legged.envs import LeggedRobot
-from legged.envs.legged_gym_names import ABSENT, COMPUTED, CONSTANT, KEPT, PLAIN, ReadOnly
+from legged.envs.legged_gym_names import ABSENT, COMPUTED, CONSTANT, KEPT, PLAIN, SUBSTEPS
+from legged.envs.views import ReadOnly
 from legged.errors import ConfigError
 from legged.math import get_euler_xyz, quat_apply_yaw, quat_from_angle_axis, quat_rotate, quat_rotate_inverse
 from legged.registry import make_task, task_config
@@ -122,7 +123,7 @@ def test_ground_under_a_point_is_that_of_the_height_scan():
 
 def test_angles_of_feet_are_those_of_their_bodies():
     """Roll and yaw of the rotation matrices that C MuJoCo computes for the same positions."""
-    turning = type("Turning", (LeggedRobot,), {"QUANTITIES": ("xquat",)})(small_config())
+    turning = type("Turning", (LeggedRobot,), {"_reward_toes": lambda self: self.feet_yaw.sum(dim=1)})(small_config())
     torch.manual_seed(5)
     for _ in range(5):
         turning.step(torch.randn(ROBOTS, JOINTS))
@@ -167,6 +168,72 @@ def test_accelerations_and_the_values_of_the_step_before():
             for name, seen, right in zip((*names, *targets), fork.seen, expected, strict=True):
                 torch.testing.assert_close(seen, right, rtol=1e-4, atol=1e-3, msg=name)
     assert fork.contact_forces.abs().max() > 1.0
+
+
+def test_indices_of_one_axis_more_are_those_of_the_fork(task):
+    """`last_actions` (N, D, 2) has the actions of the step before and of the one before it; `default_dof_pos` is (1, D)."""
+    older = task.last_last_actions.uniform_(-1.0, 1.0)
+    assert task.last_actions.shape == (ROBOTS, JOINTS)
+    assert task.last_actions[:, :, 0].equal(task.last_actions)
+    assert task.last_actions[:, 3:5, 1].equal(older[:, 3:5])
+    assert task.last_actions[:, 3].equal(task.actions[:, 3])
+    assert task.last_actions[:, None].shape == (ROBOTS, 1, JOINTS)
+    hips = task.joints("HAA")
+    assert task.default_dof_pos[:, hips].equal(task.default_dof_pos[hips].unsqueeze(0))
+    assert task.default_dof_pos[None, :].shape == (1, JOINTS)
+    with pytest.raises(IndexError, match="too many indices"):
+        task.last_actions[:, :, 1] = 0.0
+    for tensor in (task.last_actions[:, :, 0], task.dof_pos - task.default_dof_pos, task.last_actions.clone()):
+        assert type(tensor) is Tensor
+
+
+def test_values_of_each_physics_step_are_those_of_c_mujoco():
+    class Fork(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            return sum(getattr(self, name).sum(dim=(1, 2)) for name in SUBSTEPS)
+
+    fork = Fork(small_config(("rewards.soft_dof_pos_limit", 0.05)), graph=False)
+    fork.step(zero_actions(fork))  # the first step allocates what the term reads
+    fork.reset()
+    actions = torch.randn(ROBOTS, JOINTS, generator=torch.Generator().manual_seed(7))
+    starts = (fork.physics.qpos.double().numpy().copy(), fork.physics.qvel.double().numpy().copy())
+    fork.step(actions)
+    assert not fork.reset_buf.any()
+    low, high = fork.dof_pos_limits.unbind(dim=1)
+    for i in range(ROBOTS):
+        data = mujoco.MjData(fork.physics.model)
+        data.qpos[:], data.qvel[:] = starts[0][i], starts[1][i]
+        for k in range(4):
+            angles, velocities = torch.tensor(data.qpos[7:]), torch.tensor(data.qvel[6:])
+            target = fork.default_dof_pos + 0.5 * actions[i]
+            torques = fork.p_gains * (target - angles) - fork.d_gains * velocities
+            data.ctrl[:] = torques.clamp(-fork.torque_limits, fork.torque_limits).numpy()
+            mujoco.mj_step(fork.physics.model, data)
+            assert fork.substep_torques[i, k].tolist() == pytest.approx(data.ctrl.tolist(), abs=1e-2)
+            assert fork.substep_dof_vel[i, k].tolist() == pytest.approx(data.qvel[6:].tolist(), abs=1e-2)
+            angles = torch.tensor(data.qpos[7:], dtype=torch.float32)
+            beyond = (low - angles).clamp(min=0.0) + (angles - high).clamp(min=0.0)
+            torch.testing.assert_close(fork.substep_exceed_dof_pos_limit_abs[i, k], beyond, atol=1e-4, rtol=1e-4)
+            assert fork.substep_exceed_dof_pos_limits[i, k].equal(beyond > 0.0)
+            assert beyond.any()
+
+
+def test_tracking_before_a_step_is_that_of_the_same_commands():
+    class Fork(LeggedRobot):
+        def _reward_lin_vel_z(self):
+            self.seen = torch.stack([self.rwd_linVelTrackPrev, self.rwd_angVelTrackPrev])
+            return self.rew_buf * 0.0
+
+    fork = Fork(small_config(), graph=False)
+    fork.step(zero_actions(fork))
+    for _ in range(3):
+        fork.commands[:, :3].uniform_(-0.5, 0.5)
+        fork.remember()
+        error = fork.commands[:, :3] - torch.cat([fork.base_lin_vel[:, :2], fork.base_ang_vel[:, 2:]], dim=1)
+        square = error.square()
+        before = torch.stack([torch.exp(-square[:, :2].sum(dim=1) / 0.25), torch.exp(-square[:, 2] / 0.25)])
+        fork.step(torch.randn(ROBOTS, JOINTS))
+        torch.testing.assert_close(fork.seen, before)
 
 
 @pytest.mark.parametrize(("axis", "angle"), [(0, 0.7), (1, -0.4), (2, 3.0)])
@@ -216,7 +283,7 @@ def test_a_terrain_has_its_names():
 
 
 def test_no_name_shadows_what_the_class_has():
-    tables = (PLAIN, COMPUTED, CONSTANT, KEPT, ABSENT)
+    tables = (PLAIN, COMPUTED, CONSTANT, KEPT, SUBSTEPS, ABSENT)
     names = [name for table in tables for name in table]
     assert len(set(names)) == len(names)
     assert [name for name in names if hasattr(LeggedRobot, name)] == []
@@ -258,7 +325,7 @@ def test_a_slip_of_the_pen_has_its_nearest_name(task):
         ("torque", "torques"),
         ("terrain_level", None),  # there are no levels on a plane
         ("reset_yaw", None),  # _reset_yaw is private
-        ("front_hip_indices", None),  # hip_indices is not there
+        ("front_hip_index", None),  # hip_indices is not there
         ("hip_indice", None),
         ("last_foot_vel", None),  # last_dof_vel is something else
         ("ref_dof_pos", None),  # and so is dof_pos

@@ -221,7 +221,7 @@ def test_levels_follow_success():
     asked = [20.0, 7.0, 1.0, 1.0, 20.0, 0.0, 3.8, 3.8]
     walked = [4.1, 3.9, 0.4, 0.6, 4.1, 0.0, 3.1, 3.0]
     assert walk(levels, asked, walked, ended) == [6, 5, 4, 5, 5, 5, 6, 5]
-    x = levels._tiles.view(10, 2, 3)[levels.levels, levels.columns]
+    x = levels.tiles.view(10, 2, 3)[levels.levels, levels.columns]
     torch.testing.assert_close(levels.origins, x)
     log = levels.metrics()
     assert log["Terrain/level_flat"] == pytest.approx(5.0)  # (6 + 5 + 4 + 5) / 4

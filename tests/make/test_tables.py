@@ -8,6 +8,10 @@ import pytest
 import tables
 
 TIMING = {
+    "task": "x",
+    "finished": True,
+    "resumed": False,
+    "steps": 1,
     "robots": 4096,
     "iterations": 250,
     "start_up_s": 4.2,
@@ -49,7 +53,7 @@ def test_a_row_has_training_and_quality_of_the_shipped_run(root):
     write(root, "a1_flat/seed_2", timing=TIMING | {"loop_s": 99.0}, evaluation_mujoco=second)
     write(root, "g1_flat", timing=TIMING | {"device": "NVIDIA H100 80GB HBM3", "kernels_compiled": 3, "beside": 0})
     (root / "resources/policies/h1_flat/timing.json").unlink()
-    rows = {line.split("|")[1]: line for line in tables.flat(tables.Shipped(root)).splitlines()}
+    rows = {line.split("|")[1]: line for line in tables.flat(root / "resources/policies").splitlines()}
     quality = "0.055 (0.110)|0.049 (0.081)|0.05|0.055"
     assert rows["`a1_flat`"] == f"|`a1_flat`|H200|4096 x 250|24 (4, 17.6)|4|{quality}|0.045 (0.035 to 0.055)|"
     assert rows["`g1_flat`"] == f"|`g1_flat`|H100|4096 x 250|24 (4*, 17.6)|0|{quality}|-|"
@@ -62,8 +66,17 @@ def test_success_is_that_of_the_last_trained_step_height_and_the_next(root):
         write(
             root, f"{robot}_real", timing=TIMING, evaluation_mujoco={"rough": evaluation(), "task": "x", "success": success}
         )
-    row = tables.real(tables.Shipped(root)).splitlines()[2]
+    row = tables.real(root / "resources/policies").splitlines()[2]
     assert row.endswith("|0.055 (0.110)|0.049 (0.081)|0.05|0.20, 0.30|75, 62|75, 62|75, 62|8|")
+
+
+def test_what_was_not_measured_is_a_dash():
+    """Robots that all fell, terrain types and sizes that were not evaluated, and a single size beyond the training's."""
+    assert tables.errors(evaluation(rmse_lin={"mean": None, "worst": None}, falls=1.0))[::2] == ["-", "100.00"]
+    assert tables.crossings(evaluation()) == ["-"] * 5
+    one = {"trained_to": None, "points": [{"size": 0.3, "share": 0.5}]}
+    success = {"robots_per_point": 8, "types": {"stairs_up": one, "stairs_down": POINTS | {"points": []}}}
+    assert tables.crossings(evaluation(success=success)) == ["0.30", "50", "-", "-", "8"]
 
 
 def test_a_changed_digit_is_found_and_mended(root, capsys):

@@ -1,15 +1,15 @@
-"""Processes side by side: limits per kind, order of trainings, stops and reasons for failures."""
+"""Processes side by side: their number, their order, stops and reasons for failures."""
 
 import signal
 import sys
 
 import pytest
 
-from legged.process.processes import BUILT, Job, Kind, WorkerPool, why_failed
+from legged.process.processes import BUILT, Job, WorkerPool, why_failed
 from legged.process.startup import STAGES_FILE
 
 
-def script(kind, name, log, built_after=0.0, lasts=0.3, code="", done=lambda job, code: []):
+def script(name, log, built_after=0.0, lasts=0.3, code="", done=lambda job, code: []):
     """Return a job that notes its begin and end, and reports its stage `BUILT` after some time."""
     text = (
         "import os, time\n"
@@ -21,50 +21,37 @@ def script(kind, name, log, built_after=0.0, lasts=0.3, code="", done=lambda job
         f"time.sleep({lasts})\n"
         "note('ends')\n"
     )
-    return Job(kind, [sys.executable, "-c", text], log.with_name(f"{name}.txt"), done)
-
-
-def ran(jobs, room, shared=()):
-    """Run jobs in a pool; return their notes in the order of time."""
-    log = jobs[0].output.with_name("log")
-    WorkerPool(room, shared).run(jobs)
-    return log.read_text().splitlines()
+    return Job([sys.executable, "-c", text], log.with_name(f"{name}.txt"), done)
 
 
 @pytest.mark.slow
-def test_as_many_run_side_by_side_as_there_is_room_for(tmp_path):
-    jobs = [script(Kind.ON_CORES, name, tmp_path / "log") for name in "abc"]
-    noted = ran(jobs, {Kind.ON_CORES: 2})
-    assert noted.index("b begins") < noted.index("a ends")
-    assert noted.index("c begins") > min(noted.index("a ends"), noted.index("b ends"))
-
-
-@pytest.mark.slow
-def test_a_training_begins_when_the_one_before_it_is_built(tmp_path):
-    jobs = [script(Kind.TRAINING, name, tmp_path / "log", built_after=0.2, lasts=1.0) for name in "abc"]
-    noted = ran(jobs, {Kind.TRAINING: 2})
+def test_a_training_begins_when_there_is_room_and_the_one_before_it_is_built(tmp_path):
+    log = tmp_path / "log"
+    WorkerPool(2).run([script(name, log, built_after=0.2, lasts=1.0) for name in "abc"])
+    noted = log.read_text().splitlines()
     assert noted[:3] == ["a begins", "a is built", "b begins"]
     assert noted.index("a ends") < noted.index("c begins")
     assert not list(tmp_path.glob("*.stages"))
 
 
 @pytest.mark.slow
-def test_what_shares_the_device_waits_for_all_trainings_and_the_rest_does_not(tmp_path):
+def test_what_follows_from_a_job_runs_after_it(tmp_path):
     log = tmp_path / "log"
-    after = script(Kind.ON_GPU, "gpu", log)
-    first = script(Kind.TRAINING, "a", log, done=lambda job, code: [after, script(Kind.ON_CORES, "cores", log, lasts=0.1)])
-    second = script(Kind.TRAINING, "b", log, lasts=1.0)
-    noted = ran([first, second], dict.fromkeys(Kind, 1), (Kind.ON_GPU,))
-    assert noted.index("a ends") < noted.index("cores begins") < noted.index("b ends") < noted.index("gpu begins")
+    after = script("b", log)
+    WorkerPool(1).run([script("a", log, done=lambda job, code: [after])])
+    assert [line for line in log.read_text().splitlines() if "is built" not in line] == [
+        *("a begins", "a ends"),
+        *("b begins", "b ends"),
+    ]
 
 
 def test_a_pool_that_is_stopped_starts_nothing_more_and_tells_those_that_run(tmp_path):
     log = tmp_path / "log"
     asked = "import signal\nsignal.signal(signal.SIGTERM, lambda *_: (note('was asked'), exit(3)))"
     codes = []
-    jobs = [script(Kind.TRAINING, "a", log, lasts=60, code=asked, done=lambda job, code: codes.append(code) or [])]
-    jobs.append(script(Kind.TRAINING, "b", log))
-    pool = WorkerPool({Kind.TRAINING: 1}, ())
+    jobs = [script("a", log, lasts=60, code=asked, done=lambda job, code: codes.append(code) or [])]
+    jobs.append(script("b", log))
+    pool = WorkerPool(1)
     handler = signal.signal(signal.SIGALRM, lambda *_: pool.stop() if log.is_file() and "built" in log.read_text() else None)
     signal.setitimer(signal.ITIMER_REAL, 0.1, 0.1)
     try:
@@ -77,7 +64,7 @@ def test_a_pool_that_is_stopped_starts_nothing_more_and_tells_those_that_run(tmp
 
 
 def test_why_a_process_failed(tmp_path):
-    job = Job(Kind.TRAINING, [], tmp_path / "out.txt", lambda job, code: [])
+    job = Job([], tmp_path / "out.txt", lambda job, code: [])
     assert why_failed(job, 7) == "exit code 7"
     job.output.write_text("hello\nValueError: no\n\n")
     assert why_failed(job, 1) == "ValueError: no"
