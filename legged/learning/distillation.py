@@ -116,7 +116,8 @@ class DeviceDistillation(Distillation):
         labels = self.storage.privileged_actions
         for x, wanted in zip(inputs.split(self.gradient_length), labels.split(self.gradient_length), strict=True):
             self._forget_gradients()
-            self._step(self.threads.backward(self._gradients, (x.flatten(0, 1), wanted.flatten(0, 1)), self._learned))
+            chunks = self.threads.chunks((x.flatten(0, 1), wanted.flatten(0, 1)))
+            self._step(self.threads.backward(self._gradients, chunks, self._learned))
 
     def _gradients(self, inputs: Tensor, wanted: Tensor) -> tuple[Sequence[Tensor], Tensor]:
         """Return the gradients for inputs (n, width) and wanted actions (n, D) of a gradient's steps, and the mean loss (1,).

@@ -18,7 +18,7 @@ from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.distributed import SharedGradients
 from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
 from legged.learning.networks import action_std, output_of, update_normalizer
-from legged.learning.row_threads import RowThreads
+from legged.learning.row_threads import Chunks, RowThreads
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate, and the factor by which one adaptation raises or lowers it, as in rsl-rl."""
@@ -192,7 +192,7 @@ class DevicePPO(CriticWarmup):
         batches = self._mini_batches()
         for _ in range(epochs or self.num_learning_epochs):
             for batch in batches:
-                self._losses += self._step(*batch)
+                self._losses += self._step(batch)
         self._losses[:-1] /= self._losses[-1:].clone()
         self._losses[-1:] /= self.num_learning_epochs * self.num_mini_batches
         self._update_normalizers()
@@ -219,7 +219,7 @@ class DevicePPO(CriticWarmup):
         return {**dict(zip(LOSSES, losses, strict=False)), **errors}
 
     @torch.no_grad()
-    def _mini_batches(self) -> list[tuple[Tensor, ...]]:
+    def _mini_batches(self) -> list[Chunks]:
         """Return the shuffled rollout as mini-batches of n samples. Each has the inputs of actor and critic (n, width), the
         actions (n, D), the old log-probabilities, advantages, old values and returns (n,), and the mean and standard
         deviation (n, D) of the old Gaussian.
@@ -256,14 +256,14 @@ class DevicePPO(CriticWarmup):
                 (advantages - samples.mean()) / (samples.std() + FEW)
                 for advantages, samples in zip(shuffled[ADVANTAGES], own, strict=True)
             )
-        return list(zip(*shuffled, strict=True))
+        return [self.threads.chunks(batch) for batch in zip(*shuffled, strict=True)]
 
     def _order(self, count: int) -> Tensor:
         """Return a random permutation of `count` samples, found by sorting random numbers. A CUDA graph can hold a sort."""
         return torch.rand(count, device=self.device).argsort()
 
-    def _step(self, *batch: Tensor) -> Tensor:
-        """Adapt the learning rate and take a gradient step on a mini-batch of `_mini_batches`. Return its figures (`_loss`)
+    def _step(self, batch: Chunks) -> Tensor:
+        """Adapt the learning rate and take a gradient step on a mini-batch. Return its figures (`_loss`)
         and a count of 1. If a gradient or the value loss is NaN or infinite, return zeros without a step.
         """
         if self.is_multi_gpu:

@@ -8,6 +8,8 @@ from torch import Tensor
 
 CHUNK = 2048
 """Most rows of a chunk. The activations of a chunk stay in the cache of a core, those of a whole mini-batch do not."""
+Chunks = list[tuple[float, Sequence[Tensor]]]
+"""Chunks of a mini-batch: share of its rows, and tensors."""
 
 
 class RowThreads:
@@ -23,31 +25,36 @@ class RowThreads:
         several = count is not None and count > 1
         self._pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) if several else None
 
+    def chunks(self, batch: Sequence[Tensor]) -> Chunks:
+        """Split a mini-batch. Its tensors have n rows, or 2 n, if mirror images of the rows follow them. A chunk has the same
+        rows of all tensors.
+        """
+        rows, most = min(map(len, batch)), max(map(len, batch))
+        size = max(CHUNK * rows // most, 1) if self._splits else rows
+        if size >= rows:
+            return [(1.0, batch)]
+        parts = [x.unflatten(0, (-1, rows)).split(size, dim=1) for x in batch]
+        return [(own[0].shape[1] / rows, [x.flatten(0, 1) for x in own]) for own in zip(*parts, strict=True)]
+
     def backward(
         self,
         gradients: Callable[..., tuple[Sequence[Tensor | None], Tensor]],
-        batch: Sequence[Tensor],
+        chunks: Chunks,
         parameters: Sequence[torch.nn.Parameter],
     ) -> Tensor:
         """Add the gradient of a mini-batch's loss to the `parameters`, and return the figures (K,) of the mini-batch.
 
-        `batch` has tensors of n rows, or of 2 n, if mirror images of the rows follow them. `gradients` takes the same rows of
-        all tensors. It returns a gradient or None for each parameter, and the figures (K,), all of them means over the rows.
+        `gradients` takes the tensors of a chunk. It returns a gradient or None for each parameter, and the figures (K,), all
+        of them means over the rows.
         """
-        rows, most = min(map(len, batch)), max(map(len, batch))
-        size = max(CHUNK * rows // most, 1) if self._splits else rows
-
-        def chunk(start: int) -> tuple[Sequence[Tensor | None], Tensor, float]:
-            stop = min(start + size, rows)
-            own = batch if stop - start == rows else [x.unflatten(0, (-1, rows))[:, start:stop].flatten(0, 1) for x in batch]
-            return *gradients(*own), (stop - start) / rows
-
-        total = torch.zeros((), device=batch[0].device)
-        for found, figures, share in (self._pool.map if self._pool else map)(chunk, range(0, rows, size)):
+        results = (self._pool.map if self._pool else map)(lambda chunk: gradients(*chunk[1]), chunks)
+        total: Tensor | float = 0.0
+        for (share, _), (found, figures) in zip(chunks, results, strict=True):
             total = total + share * figures
             for parameter, gradient in zip(parameters, found, strict=True):
                 if gradient is not None and parameter.grad is not None:
                     parameter.grad.add_(gradient, alpha=share)
                 elif gradient is not None:
                     parameter.grad = gradient if share == 1.0 else share * gradient
+        assert isinstance(total, Tensor)
         return total

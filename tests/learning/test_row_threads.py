@@ -32,7 +32,8 @@ def test_chunks_add_up_to_the_mini_batch(threads):
         figures = torch.stack([value, image.mean()]).detach()
         return torch.autograd.grad(value, parameters, allow_unused=True), figures
 
-    figures = RowThreads(threads).backward(gradients, (x, wanted), parameters)
+    several = RowThreads(threads)
+    figures = several.backward(gradients, several.chunks((x, wanted)), parameters)
     whole, expected = gradients(x, wanted)
     torch.testing.assert_close(figures, expected)
     for parameter, gradient in zip(layer.parameters(), whole, strict=False):
@@ -45,7 +46,8 @@ def test_gradients_are_added_to_those_that_are_there():
     weight = nn.Parameter(torch.tensor([2.0]))
     buffer = torch.tensor([10.0])
     weight.grad = buffer
-    RowThreads(1).backward(lambda x: ([x.mean().unsqueeze(0)], x.mean().unsqueeze(0)), (torch.arange(21.0),), [weight])
+    one = RowThreads(1)
+    one.backward(lambda x: ([x.mean().unsqueeze(0)], x.mean().unsqueeze(0)), one.chunks((torch.arange(21.0),)), [weight])
     assert buffer.item() == pytest.approx(10.0 + 10.0)
 
 
@@ -54,7 +56,7 @@ def test_an_error_in_a_thread_reaches_the_caller():
         raise ValueError("mine")
 
     with pytest.raises(ValueError, match="mine"):
-        RowThreads(2).backward(fail, (torch.zeros(40, 1),), [])
+        RowThreads(2).backward(fail, RowThreads(2).chunks((torch.zeros(40, 1),)), [])
 
 
 @pytest.mark.slow
