@@ -61,6 +61,7 @@ class DevicePPO(CriticWarmup):
         each term if there is an estimator, and the share of mini-batches that were used."""
         self._one = torch.ones(1, device=self.device)
         self.threads = RowThreads()
+        """Threads that compute gradients on a CPU. By default mini-batches are not split."""
         plain = not self.why_stock and type(self.actor) is MLPModel and not self.use_mixed_precision
         self._in_closed_form = (
             plain and self.device == "cpu" and all(closed_form.fits(model.mlp) for model in (self.actor, self.critic))
@@ -263,8 +264,8 @@ class DevicePPO(CriticWarmup):
         return torch.rand(count, device=self.device).argsort()
 
     def _step(self, batch: Chunks) -> Tensor:
-        """Adapt the learning rate and take a gradient step on a mini-batch. Return its figures (`_loss`)
-        and a count of 1. If a gradient or the value loss is NaN or infinite, return zeros without a step.
+        """Adapt the learning rate and take a gradient step on a mini-batch. Return its figures (`_loss`) and a count of 1. If a
+        gradient or the value loss is NaN or infinite, return zeros without a step.
         """
         if self.is_multi_gpu:
             self._shared.zero_()
