@@ -264,8 +264,8 @@ class DevicePPO(CriticWarmup):
         return torch.rand(count, device=self.device).argsort()
 
     def _step(self, batch: Chunks) -> Tensor:
-        """Adapt the learning rate and take a gradient step on a mini-batch. Return its figures (`_loss`) and a count of 1. If a
-        gradient or the value loss is NaN or infinite, return zeros without a step.
+        """Adapt the learning rate and take a gradient step on a mini-batch. Return its figures (`_loss`) and a count of 1; or
+        return zeros without a step, if a gradient or the value loss is NaN or infinite.
         """
         if self.is_multi_gpu:
             self._shared.zero_()
