@@ -323,7 +323,9 @@ class DevicePPO(CriticWarmup):
         if not self._critic_alone:
             found |= zip(actor.mlp.parameters(), closed_form.backward(actor.mlp, *acted, by_mean / rows), strict=True)
             (learned_std,) = actor.distribution.parameters()
-            found[learned_std] = torch.autograd.grad(bounded, learned_std, by_std / rows - self.entropy_coef / std)[0]
+            with torch.enable_grad():
+                weighted = (bounded * (by_std / rows - self.entropy_coef / std)).sum()
+            (found[learned_std],) = torch.autograd.grad(weighted, learned_std)
         return [found.get(parameter) for parameter in self._learned], figures
 
     def _loss(

@@ -118,11 +118,11 @@ def test_an_update_s_gradient_of_the_estimator_is_that_of_the_squared_error(symm
     mirror = {"env": None, "data_augmentation_func": twice, "use_data_augmentation": True}
     alg = learner(max_grad_norm=1e9, **({"symmetry_cfg": mirror} if symmetric else {}))
     fill(alg)
-    batch = alg._mini_batches()[0]
+    ((_, batch),) = alg._mini_batches()[0]
     before, policy = copy.deepcopy(alg.actor), []
     for targets in (batch[-1], batch[-1] + 1.0):
         alg.actor.load_state_dict(before.state_dict())
-        alg._step(*batch[:-1], targets)
+        alg._step([(1.0, [*batch[:-1], targets])])
         found = before.estimator(batch[0])
         wanted = torch.autograd.grad((found - targets).square().mean(), list(before.estimator.parameters()))
         for parameter, gradient in zip(alg.actor.estimator.parameters(), wanted, strict=True):
@@ -180,7 +180,7 @@ def test_targets_are_mirrored_with_the_observations_they_are_estimated_from():
     with ForbidHostReads():
         rollout.collect()
         runner.alg.learn()
-    seen, *_, targets = runner.alg._mini_batches()[0]
+    ((_, (seen, *_, targets)),) = runner.alg._mini_batches()[0]
     n = len(targets) // 2
     assert targets.shape[1] == 3
     assert float(targets[:, 1].abs().max()) > 0.01

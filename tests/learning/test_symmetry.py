@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from legged.cli.train import train
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
+from legged.learning import closed_form
 from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
 from legged.learning.symmetry import augment
@@ -138,14 +139,20 @@ def test_rsl_rl_learns_from_both(kind, monkeypatch):
     runner = kind(task, None, "cpu")
     seen = []
     first_layer = runner.alg.critic.mlp[0]
-    linear = torch.nn.functional.linear
+    linear, forward = torch.nn.functional.linear, closed_form.forward
 
-    def watched(x, weight, bias=None):
+    def watched_linear(x, weight, bias=None):
         if weight is first_layer.weight:
             seen.append(len(x))
         return linear(x, weight, bias)
 
-    monkeypatch.setattr(torch.nn.functional, "linear", watched)
+    def watched_forward(layers, x):
+        if layers is runner.alg.critic.mlp:
+            seen.append(len(x))
+        return forward(layers, x)
+
+    monkeypatch.setattr(torch.nn.functional, "linear", watched_linear)
+    monkeypatch.setattr(closed_form, "forward", watched_forward)
     losses = []
     log = runner.logger.log
     runner.logger.log = lambda **values: (losses.append(values["loss_dict"]), log(**values))
