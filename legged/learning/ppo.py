@@ -4,7 +4,7 @@ rsl-rl, but losses are computed in closed form, and data is shuffled once per up
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.models import MLPModel
@@ -23,11 +23,34 @@ from legged.learning.row_threads import Chunks, RowThreads
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate, and the factor by which one adaptation raises or lowers it, as in rsl-rl."""
 FEW = 1e-8
-ADVANTAGES = 4
-"""Position of the advantages among the tensors of a mini-batch."""
 LOSSES = ("value", "surrogate", "entropy", "kl", "symmetry")
 """Logged losses of an update, by rsl-rl's names. `kl` is the divergence from the policy that acted to the policy that learns.
 `symmetry` is the mean square difference between the policy and its mirror image, logged only if symmetry is on."""
+
+
+class MiniBatch(NamedTuple):
+    """Tensors of n samples. With symmetry, most have 2 n rows, because the mirror images follow the samples."""
+
+    actor_input: Tensor
+    """(n or 2 n, width) inputs of the actor."""
+    critic_input: Tensor
+    """(n or 2 n, width) inputs of the critic."""
+    actions: Tensor
+    """(n or 2 n, D) actions."""
+    old_log_prob: Tensor
+    """(n or 2 n,) log-probabilities of the samples under the policy that acted."""
+    advantages: Tensor
+    """(n or 2 n,) advantages."""
+    old_values: Tensor
+    """(n or 2 n,) values before the update."""
+    returns: Tensor
+    """(n or 2 n,) returns."""
+    old_mean: Tensor
+    """(n, D) mean of the Gaussian that acted."""
+    old_std: Tensor
+    """(n, D) standard deviation of the Gaussian that acted."""
+    targets: Tensor | None = None
+    """(n or 2 n, E) targets of the actor's estimator, if it has one."""
 
 
 class DevicePPO(CriticWarmup):
@@ -64,7 +87,9 @@ class DevicePPO(CriticWarmup):
         """Threads that compute gradients on a CPU. By default mini-batches are not split."""
         plain = not self.why_stock and type(self.actor) is MLPModel and not self.use_mixed_precision
         self._in_closed_form = (
-            plain and self.device == "cpu" and all(closed_form.fits(model.mlp) for model in (self.actor, self.critic))
+            plain
+            and torch.device(self.device).type == "cpu"
+            and all(closed_form.fits(model.mlp) for model in (self.actor, self.critic))
         )
         self._critic_alone = False
         """True while an update of the value function alone runs or is captured."""
@@ -221,13 +246,7 @@ class DevicePPO(CriticWarmup):
 
     @torch.no_grad()
     def _mini_batches(self) -> list[Chunks]:
-        """Return the shuffled rollout as mini-batches of n samples. Each has the inputs of actor and critic (n, width), the
-        actions (n, D), the old log-probabilities, advantages, old values and returns (n,), and the mean and standard
-        deviation (n, D) of the old Gaussian.
-
-        With symmetry, all but the mean and standard deviation have 2 n rows, because the mirror images follow the samples.
-        With an estimator, its targets (n or 2 n, E) come last.
-        """
+        """Return the shuffled rollout as mini-batches (see `MiniBatch`), each in chunks."""
         st = self.storage
         observations, actions = st.observations.flatten(0, 1), st.actions.flatten(0, 1)
         samples = len(actions)
@@ -251,13 +270,14 @@ class DevicePPO(CriticWarmup):
         if isinstance(self.actor, EstimatingModel):
             columns.append((torch.cat([observations[name] for name in self.actor.target_groups], dim=-1), imaged))
         shuffled = [column.index_select(0, index.flatten()).split(index.shape[1]) for column, index in columns]
+        batches = [MiniBatch(*tensors) for tensors in zip(*shuffled, strict=True)]
         if self.normalize_advantage_per_mini_batch:
-            own = [advantages[:count] for advantages in shuffled[ADVANTAGES]]
-            shuffled[ADVANTAGES] = tuple(
-                (advantages - samples.mean()) / (samples.std() + FEW)
-                for advantages, samples in zip(shuffled[ADVANTAGES], own, strict=True)
-            )
-        return [self.threads.chunks(batch) for batch in zip(*shuffled, strict=True)]
+            own = [batch.advantages[:count] for batch in batches]
+            batches = [
+                batch._replace(advantages=(batch.advantages - samples.mean()) / (samples.std() + FEW))
+                for batch, samples in zip(batches, own, strict=True)
+            ]
+        return [self.threads.chunks([tensor for tensor in batch if tensor is not None]) for batch in batches]
 
     def _order(self, count: int) -> Tensor:
         """Return a random permutation of `count` samples, found by sorting random numbers. A CUDA graph can hold a sort."""
@@ -285,39 +305,36 @@ class DevicePPO(CriticWarmup):
         self.optimizer.step()
         return torch.where(fine, torch.cat([figures, self._one]), 0.0)
 
-    def _gradients(self, *batch: Tensor) -> tuple[Sequence[Tensor | None], Tensor]:
-        """Return the gradient of a mini-batch's loss by each learned parameter, and the figures (K,) of `_loss`."""
+    def _gradients(self, *tensors: Tensor) -> tuple[Sequence[Tensor | None], Tensor]:
+        """Return the gradient of a mini-batch's loss by each learned parameter, and the figures (K,) of `_loss`. `tensors`
+        are the fields of a `MiniBatch`.
+        """
+        batch = MiniBatch(*tensors)
         if self._in_closed_form:
-            return self._gradients_in_closed_form(*batch)
-        loss, figures = self._loss(*batch)
+            return self._gradients_in_closed_form(batch)
+        loss, figures = self._loss(batch)
         return torch.autograd.grad(loss, self._learned, allow_unused=True), figures
 
     @torch.no_grad()
-    def _gradients_in_closed_form(
-        self,
-        actor_input: Tensor,
-        critic_input: Tensor,
-        actions: Tensor,
-        old_log_prob: Tensor,
-        advantages: Tensor,
-        old_values: Tensor,
-        returns: Tensor,
-        old_mean: Tensor,
-        old_std: Tensor,
-    ) -> tuple[Sequence[Tensor | None], Tensor]:
+    def _gradients_in_closed_form(self, batch: MiniBatch) -> tuple[Sequence[Tensor | None], Tensor]:
         """Return the same as `_gradients` without autograd."""
         actor, critic = self.actor, self.critic
         with torch.enable_grad():
             bounded = self.action_std()
         std = bounded.detach()
-        acted = closed_form.forward(actor.mlp, actor.obs_normalizer(actor_input))
-        valued = closed_form.forward(critic.mlp, critic.obs_normalizer(critic_input))
-        mean, rows = acted[0][-1], len(actions)
-        surrogate, by_mean, by_std = closed_form.surrogate_loss(mean, std, actions, old_log_prob, advantages, self.clip_param)
-        errors, by_value = closed_form.value_loss(
-            valued[0][-1].squeeze(-1), returns, old_values, self.clip_param if self.use_clipped_value_loss else None
+        acted = closed_form.forward(actor.mlp, actor.obs_normalizer(batch.actor_input))
+        valued = closed_form.forward(critic.mlp, critic.obs_normalizer(batch.critic_input))
+        mean, rows = acted[0][-1], len(batch.actions)
+        surrogate, by_mean, by_std = closed_form.surrogate_loss(
+            mean, std, batch.actions, batch.old_log_prob, batch.advantages, self.clip_param
         )
-        figures = self._figures(mean, std, old_mean, old_std, errors.mean(), surrogate.mean())
+        errors, by_value = closed_form.value_loss(
+            valued[0][-1].squeeze(-1),
+            batch.returns,
+            batch.old_values,
+            self.clip_param if self.use_clipped_value_loss else None,
+        )
+        figures = self._figures(batch, mean, std, errors.mean(), surrogate.mean())
         of_critic = closed_form.backward(critic.mlp, *valued, (self.value_loss_coef / rows * by_value).unsqueeze(-1))
         found = dict(zip(critic.mlp.parameters(), of_critic, strict=True))
         if not self._critic_alone:
@@ -328,56 +345,43 @@ class DevicePPO(CriticWarmup):
             (found[learned_std],) = torch.autograd.grad(weighted, learned_std)
         return [found.get(parameter) for parameter in self._learned], figures
 
-    def _loss(
-        self,
-        actor_input: Tensor,
-        critic_input: Tensor,
-        actions: Tensor,
-        old_log_prob: Tensor,
-        advantages: Tensor,
-        old_values: Tensor,
-        returns: Tensor,
-        old_mean: Tensor,
-        old_std: Tensor,
-        targets: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    def _loss(self, batch: MiniBatch) -> tuple[Tensor, Tensor]:
         """Return the loss () of a mini-batch, and its figures (K,): the losses in the order of `LOSSES`, and the estimation
         errors.
         """
-        samples = len(old_mean)
-        mean, estimates = self._act(actor_input)
-        values = output_of(self.critic, critic_input, self.use_mixed_precision).squeeze(-1)
+        samples = len(batch.old_mean)
+        mean, estimates = self._act(batch.actor_input)
+        values = output_of(self.critic, batch.critic_input, self.use_mixed_precision).squeeze(-1)
         std = self.action_std()
-        log_prob = gaussian_log_prob(actions, mean, std)
-        ratio = torch.exp(log_prob - old_log_prob)
+        log_prob = gaussian_log_prob(batch.actions, mean, std)
+        ratio = torch.exp(log_prob - batch.old_log_prob)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-advantages * ratio, -advantages * clipped).mean()
-        value_loss = (values - returns).square()
+        surrogate = torch.max(-batch.advantages * ratio, -batch.advantages * clipped).mean()
+        value_loss = (values - batch.returns).square()
         if self.use_clipped_value_loss:
-            near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
-            value_loss = torch.max(value_loss, (near - returns).square())
+            near = batch.old_values + (values - batch.old_values).clamp(-self.clip_param, self.clip_param)
+            value_loss = torch.max(value_loss, (near - batch.returns).square())
         value_loss = value_loss.mean()
         loss = self.value_loss_coef * value_loss
         if not self._critic_alone:
             loss = loss + surrogate - self.entropy_coef * entropy(std)
-        figures = self._figures(mean, std, old_mean, old_std, value_loss, surrogate)
-        if targets is not None and estimates is not None:
+        figures = self._figures(batch, mean, std, value_loss, surrogate)
+        if batch.targets is not None and estimates is not None:
             # One backward pass serves PPO's loss and the estimator's. PPO's loss also trains the estimator's hidden layers if
             # there are `latent` outputs, and the whole estimator if `policy_gradient` is set.
             if not self._critic_alone:
-                loss = loss + (estimates - targets).square().mean()
+                loss = loss + (estimates - batch.targets).square().mean()
             assert self._errors is not None
-            errors = self._errors.squares(estimates[:samples].detach(), targets[:samples]).mean(dim=0)
+            errors = self._errors.squares(estimates[:samples].detach(), batch.targets[:samples]).mean(dim=0)
             figures = torch.cat([figures, errors])
         return loss, figures
 
     @torch.no_grad()
-    def _figures(
-        self, mean: Tensor, std: Tensor, old_mean: Tensor, old_std: Tensor, value_loss: Tensor, surrogate: Tensor
-    ) -> Tensor:
-        """Return the losses (K,) in the order of `LOSSES`."""
-        samples = len(old_mean)
-        losses = [value_loss, surrogate, entropy(std), divergence(old_mean, old_std, mean[:samples], std)]
+    def _figures(self, batch: MiniBatch, mean: Tensor, std: Tensor, value_loss: Tensor, surrogate: Tensor) -> Tensor:
+        """Return the losses (K,) in the order of `LOSSES`. `mean` and `std` are those of the policy that learns."""
+        samples = len(batch.old_mean)
+        kl = divergence(batch.old_mean, batch.old_std, mean[:samples], std)
+        losses = [value_loss, surrogate, entropy(std), kl]
         if self.symmetry:
             images = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=None, actions=mean[:samples])[1]
             losses.append((mean[samples:] - images[samples:]).square().mean())

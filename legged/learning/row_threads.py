@@ -20,7 +20,7 @@ class RowThreads:
     """
 
     def __init__(self, count: int | None = None) -> None:
-        """Take the number of threads. With None, the rows are not split, as a GPU wants it."""
+        """Take the number of threads. With None, mini-batches are not split, as is best on a GPU."""
         self._splits = count is not None
         several = count is not None and count > 1
         self._pool = ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) if several else None
@@ -48,13 +48,14 @@ class RowThreads:
         of them means over the rows.
         """
         results = (self._pool.map if self._pool else map)(lambda chunk: gradients(*chunk[1]), chunks)
-        total: Tensor | float = 0.0
+        total: Tensor | None = None
         for (share, _), (found, figures) in zip(chunks, results, strict=True):
-            total = total + share * figures
+            own = figures if share == 1.0 else share * figures
+            total = own if total is None else total + own
             for parameter, gradient in zip(parameters, found, strict=True):
                 if gradient is not None and parameter.grad is not None:
                     parameter.grad.add_(gradient, alpha=share)
                 elif gradient is not None:
                     parameter.grad = gradient if share == 1.0 else share * gradient
-        assert isinstance(total, Tensor)
+        assert total is not None
         return total
