@@ -2,6 +2,13 @@
 
 import legged.process.headless  # noqa: F401, I001  (chooses how to render, before MuJoCo is imported)
 
+import os
+
+import torch
+
+# Without a GPU, Triton's interpreter runs the update's kernels. Triton reads this when tensordict imports it.
+os.environ.setdefault("TRITON_INTERPRET", "0" if torch.cuda.is_available() else "1")
+
 import functools
 import signal
 from collections.abc import Callable, Iterator
@@ -11,7 +18,6 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-import torch
 from devices import CUDA, ON_A_GPU, build, on_gpu
 from helpers import kept_global_state
 

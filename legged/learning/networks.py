@@ -146,6 +146,16 @@ def output_of(model: MLPModel, inputs: Tensor, mixed_precision: bool) -> Tensor:
         return model.mlp(model.obs_normalizer(inputs)).float()
 
 
+def normalization(model: MLPModel) -> tuple[Tensor | float, Tensor | float]:
+    """Return what a network subtracts from its inputs, and the factor by which it multiplies the rest, each (1, width) or a
+    number.
+    """
+    normalizer = model.obs_normalizer
+    if not isinstance(normalizer, EmpiricalNormalization):
+        return 0.0, 1.0
+    return normalizer._mean, 1.0 / (normalizer._std + normalizer.eps)
+
+
 @torch.no_grad()
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor) -> None:
     """Update the running mean and variance with the samples of all processes, as rsl-rl does. `x` (n, width) holds those

@@ -3,8 +3,8 @@ rsl-rl, but losses are computed in closed form, and data is shuffled once per up
 """
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from rsl_rl.models import MLPModel
@@ -17,8 +17,12 @@ from legged.learning.closed_form import HALF_LOG_2PI
 from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.distributed import SharedGradients
 from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
+from legged.learning.fused_update import why_not
 from legged.learning.networks import action_std, output_of, update_normalizer
 from legged.learning.row_threads import Chunks, RowThreads
+
+if TYPE_CHECKING:
+    from legged.learning.fused_update.update import FusedUpdate
 
 LOWEST_RATE, HIGHEST_RATE, RATE_STEP = 1e-5, 1e-2, 1.5
 """Bounds of the adaptive learning rate, and the factor by which one adaptation raises or lowers it, as in rsl-rl."""
@@ -65,6 +69,7 @@ class DevicePPO(CriticWarmup):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._rate: Tensor | None = None
+        self._fused: FusedUpdate | None = None
         super().__init__(*args, **kwargs)
         self.why_stock = self._why_stock()
         """Reason why rsl-rl's own update is used; empty if it is not."""
@@ -75,7 +80,11 @@ class DevicePPO(CriticWarmup):
             self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
             # While found_inf is 1, a fused step leaves the parameters, the moments and the step count unchanged.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
-            if self.is_multi_gpu:
+            if not (reason := why_not(self)):
+                self.use_kernels()
+            elif self._rate.is_cuda:
+                print(f"the update runs without fused kernels: {reason}", flush=True)
+            if self.is_multi_gpu and self._fused is None:
                 self._shared = SharedGradients(self._learned, self.gpu_world_size)
         count = len(LOSSES) if self.symmetry else len(LOSSES) - 1
         self._errors: EstimationErrors | None = None
@@ -98,6 +107,13 @@ class DevicePPO(CriticWarmup):
 
     fits_graph = True
     """True if a CUDA graph can capture an update. Features that can't be captured use rsl-rl's own loop."""
+
+    def use_kernels(self, kind: torch.dtype = torch.float16) -> None:
+        """Compute updates by Triton kernels, whose products have operands of type `kind`."""
+        from legged.learning.fused_update.update import FusedUpdate  # this imports Triton, which a CPU need not have
+
+        assert self._rate is not None
+        self._fused = FusedUpdate(self, self._rate, (LOWEST_RATE, HIGHEST_RATE, RATE_STEP), kind)
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
         """Set the object that measures estimation errors, and the learning rate of the actor's estimator. Call this once,
@@ -169,6 +185,8 @@ class DevicePPO(CriticWarmup):
                 group.update(lr=rate, fused=True, capturable=self._rate.is_cuda)
             for state in self.optimizer.state.values():
                 state["step"] = state["step"].to(self.device, torch.float32)
+            if self._fused is not None:
+                self._fused.take_state()
         return iteration
 
     def save(self) -> dict:
@@ -178,11 +196,13 @@ class DevicePPO(CriticWarmup):
         saved = super().save()
         if self._rate is not None:
             optimizer = saved["optimizer_state_dict"]
+            moments = {key: alone(state) for key, state in optimizer["state"].items()}
             plain = {"fused": None, "capturable": False}
             saved["optimizer_state_dict"] = {
-                "state": {key: {**state, "step": state["step"].cpu()} for key, state in optimizer["state"].items()},
+                "state": {key: {**state, "step": state["step"].cpu()} for key, state in moments.items()},
                 "param_groups": [{**group, "lr": float(group["lr"]), **plain} for group in optimizer["param_groups"]],
             }
+            saved |= {name: alone(saved[name]) for name in ("actor_state_dict", "critic_state_dict")}
         return saved
 
     def update(self) -> dict[str, float]:
@@ -215,10 +235,14 @@ class DevicePPO(CriticWarmup):
         one graph can hold the update.
         """
         self._losses.zero_()
-        batches = self._mini_batches()
-        for _ in range(epochs or self.num_learning_epochs):
-            for batch in batches:
-                self._losses += self._step(batch)
+        epochs = epochs or self.num_learning_epochs
+        if self._fused is not None:
+            self._fused.learn(epochs, self._critic_alone, self._losses)
+        else:
+            batches = self._mini_batches()
+            for _ in range(epochs):
+                for batch in batches:
+                    self._losses += self._step(batch)
         self._losses[:-1] /= self._losses[-1:].clone()
         self._losses[-1:] /= self.num_learning_epochs * self.num_mini_batches
         self._update_normalizers()
@@ -456,6 +480,11 @@ def divergence(old_mean: Tensor, old_std: Tensor, mean: Tensor, std: Tensor) -> 
     """
     moved = (old_std.square() + (old_mean - mean).square()) / (2.0 * std.square())
     return (torch.log(std / old_std) + moved - 0.5).sum(dim=1).mean()
+
+
+def alone(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies of tensors. A file with views of one vector, as the kernels have them, would hold the whole vector."""
+    return {name: tensor.clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()}
 
 
 def entropy(std: Tensor) -> Tensor:
