@@ -11,7 +11,6 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged.graph.step_graph import Branch
 from legged.physics.base import Physics
 from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.state_io import StateIO
@@ -38,7 +37,6 @@ class WarpPhysics(Physics):
         self._wp_device = wp.device_from_torch(device)
         self.kernels = TaskKernels(self._on_device)
         self._forces_read = False
-        self._forces_stream = Branch(device)
         self._advance: Callable[[], Any] = self._step
 
     @abstractmethod
@@ -77,15 +75,12 @@ class WarpPhysics(Physics):
 
     def refresh(self) -> None:
         forces_read, self._forces_read = self._forces_read, True
-        if not forces_read:  # without a new step, a second read would restore the forces that `write` has cleared
-            with self._forces_stream.fork(), self._on_device():
-                self._state_io.contact_forces()
         with self._on_device():
+            if not forces_read:  # without a new step, a second read would restore the forces that `write` has cleared
+                self._state_io.contact_forces()
             if self._joints is not None:
                 self._joints.read()
             self._state_io.kinematics()
-        if not forces_read:
-            self._forces_stream.join()
 
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
