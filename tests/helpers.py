@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from legged.cli.train import train
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
+from legged.learning.report_process import wait_for_reports
 from legged.registry import make_task, task_config
 
 HANG_S = 900.0
@@ -71,12 +72,15 @@ def stand(observations: TensorDict) -> torch.Tensor:
 
 
 def tiny_run(*arguments: str, num_envs: int = 8, iterations: int = 2) -> Path:
-    """Train for a moment in the working directory, which the test has moved to its tmp_path; the new run folder."""
+    """Train for a moment in the working directory, which the test has moved to its tmp_path; the new run folder,
+    with its report.
+    """
     before = set(run_folders())
     flags = ["--task", TASK, "--sim_device", "cpu", "--num_envs", str(num_envs), "--max_iterations", str(iterations)]
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(out):
         code = train.main([*flags, *TINY_TRAINING, *arguments])
     assert code == 0, out.getvalue()
+    wait_for_reports()
     (folder,) = set(run_folders()) - before
     return folder
 

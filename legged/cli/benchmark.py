@@ -294,7 +294,7 @@ def _time_start(given: Sequence[str], repeats: int) -> dict[str, Any]:
     start of the process to the end of each stage [s]. `ratio` is the end of the first iteration, divided by `torch_s`.
     """
     training = ["-m", "legged", "train", *without(given, "--out", "--repeats"), "--max-iterations", "1"]
-    runs = [(_run("-c", "import torch"), _run(*training, "train.runner.film=false")) for _ in range(repeats + 1)][1:]
+    runs = [(_run("-c", "import torch"), _run(*training, "train.runner.report=false")) for _ in range(repeats + 1)][1:]
     torch_s = median(alone["end"] for alone, _ in runs)
     stages = {name: median(stages[name] for _, stages in runs) for name in runs[0][1]}
     names = list(stages)

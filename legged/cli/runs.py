@@ -105,8 +105,8 @@ def report(args: argparse.Namespace) -> int:
     """Write a page about a run: `legged runs report anymal_c_flat`.
 
     report.html in the run's folder shows settings, curves, evaluations and the film, and needs no internet. report.md has the
-    same contents. A training writes both when it ends. This command writes them again, e.g. after an evaluation, or for a run
-    that was killed. `--film` films the policy first; `--note` stores a sentence about the run.
+    same contents. Both are written when a training ends. This command writes them again, e.g. after an evaluation, or for a
+    run that was killed. `--film` adds a new film of the policy; `--note` stores a sentence about the run.
     """
     if args.checkpoint is not None and not args.film:
         raise ConfigError(f"--checkpoint: {args.checkpoint}: has no effect without --film; add --film")
@@ -118,13 +118,15 @@ def report(args: argparse.Namespace) -> int:
         write_text(folder / NOTE_FILE, f"{note}\n")
     for folder in folders:
         ready_to_write(folder, 4.0)
+        print(f"written: {relative(write_report(folder))}", flush=True)  # this report stays if filming fails
         if args.film:
             if command_of_ours():  # if drawing hangs, this timer ends the command's process
                 faulthandler.dump_traceback_later(LONGEST_FILM_S, exit=True, file=2)
             why = _film(folder, args.checkpoint)
             faulthandler.cancel_dump_traceback_later()
+            if not why:
+                write_report(folder)
             print(f"no film: {why}" if why else f"written: {relative(folder / FILMS[0])}", flush=True)
-        print(f"written: {relative(write_report(folder))}", flush=True)
     return 0
 
 

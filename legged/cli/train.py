@@ -36,6 +36,7 @@ from legged.learning.display import Display
 from legged.learning.distributed import RankLost, check_reachable
 from legged.learning.evaluations import Evaluations
 from legged.learning.invocation import Invocation, write_invocation
+from legged.learning.report_process import start_report
 from legged.learning.resume import resumed
 from legged.learning.run_folder import NOTE_FILE, create_run, discard_run, experiment_folder, find_run
 from legged.learning.runner import Runner
@@ -283,7 +284,7 @@ class _Training:
         )
 
     def close(self, folder: Path, finished: bool) -> None:
-        """Print a summary of the training, and write its times and the report into the run folder."""
+        """Print a summary of the training, write its times into the run folder, and have its report written."""
         runner, timing = self.runner, self.timing(finished)
         if runner.evaluations is not None:
             print(*runner.evaluations.summary(timing.loop_s), sep="\n")
@@ -299,11 +300,9 @@ class _Training:
         runner.logger.hand_over(runner.current_learning_iteration)
 
     def _report(self, folder: Path, film: bool) -> None:
-        if self.cfg.train.runner.report:
-            from legged.evaluation.reports.run_report import report_at_end  # imported late; training does not need it
-
-            # The process that makes the film needs --import to find the task.
-            report_at_end(folder, given_import(self.args) if film and self.cfg.train.runner.film else None)
+        runner = self.cfg.train.runner
+        if runner.report:
+            start_report(folder, [*["--film"] * (film and runner.film), *given_import(self.args)])
 
 
 def describe(cfg: TaskConfig, device: torch.device) -> str:

@@ -176,7 +176,7 @@ class RunnerConfig:
     run_name: str = field(default="", metadata=NAME)
     """Text after the date and time in the name of the run folder."""
     report: bool = True
-    """Write report.html and report.md into the run folder at the end of a training."""
+    """Write report.html and report.md into the run folder when a training ends, in another process."""
     film: bool = True
     """Record a film of the final policy for the report. The recording takes about ten seconds. There is no film if training
     was stopped early, or if the machine cannot render."""

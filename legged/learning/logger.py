@@ -20,6 +20,7 @@ from legged.learning.divergence import FAULT, MINI_BATCHES, Diverged, Divergence
 from legged.learning.estimator import SECTION as ESTIMATES
 from legged.learning.evaluations import SECTION, Ended
 from legged.learning.kl_meter import KLMeter
+from legged.learning.report_process import wait_for_reports
 from legged.learning.trackers import Tracker, open_writer
 from legged.process.neighbours import Neighbours
 
@@ -80,8 +81,11 @@ class QuietLogger(Logger):
             self.writer.close()
 
     def hand_over(self, iteration: int) -> None:
-        """Give the videos and reports in the run folder to the tracker, if there is one, and close the tracker."""
+        """Give the videos and reports in the run folder to the tracker, if there is one, and close the tracker. Wait for the
+        report first.
+        """
         if isinstance(self.writer, Tracker):
+            wait_for_reports()
             self.writer.hand_over(Path(self.log_dir), iteration)
 
     def log(self, it: int, start_it: int, total_it: int, collect_time: float, learn_time: float, **kwargs: Any) -> None:

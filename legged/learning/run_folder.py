@@ -25,6 +25,8 @@ LOGS = Path("logs")
 CONFIG_FILE = "config.yaml"
 CODE_FILE = "code.diff"
 NOTE_FILE = "note.txt"
+REPORT = "report"
+"""Name of the report's files, before their ending."""
 SHIPPED_MODEL = "model.pt"
 BEST_MODEL = "model_best.pt"
 BEST = "best"

@@ -12,6 +12,8 @@ from subprocess import DEVNULL, STDOUT, Popen
 from legged.process.paths import make_folder
 from legged.process.startup import STAGES_FILE
 
+OF_THIS_PROCESS = (STAGES_FILE, "RANK", "LOCAL_RANK", "WORLD_SIZE")
+"""Environment variables that children do not get: the file of start-up stages, and a training's ranks on several GPUs."""
 INSTALLED = ("site-packages", "dist-packages")
 """Names of folders with installed packages."""
 POLL_S = 0.05
@@ -22,14 +24,26 @@ BUILT = "step captured"
 
 
 def child_environment() -> dict[str, str]:
-    """Return the environment for a child process in Python, so that the child imports this copy of the package. STAGES_FILE
-    is left out, because the child must not report its start-up stages to the file of this process.
+    """Return the environment for a child process in Python, so that the child imports this copy of the package. The
+    variables in OF_THIS_PROCESS are left out.
     """
-    environment = {name: value for name, value in os.environ.items() if name != STAGES_FILE}
+    environment = {name: value for name, value in os.environ.items() if name not in OF_THIS_PROCESS}
     top = Path(__file__).resolve().parents[2]
     if top.name not in INSTALLED:
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(top), os.environ.get("PYTHONPATH"))))
     return environment
+
+
+def start_apart(command: list[str], output: Path, **variables: str) -> Popen[bytes]:
+    """Start a process in its own process group, so that Ctrl-C does not reach it. Add `variables` to its environment, and
+    write its output and errors to the file `output`.
+
+    Raises:
+        OSError: the process can't be started, or the file can't be written.
+    """
+    environment = child_environment() | variables
+    with output.open("wb") as file:
+        return Popen(command, stdin=DEVNULL, stdout=file, stderr=STDOUT, env=environment, start_new_session=True)
 
 
 @dataclass(eq=False)
@@ -56,14 +70,10 @@ class Job:
         return not (self.stages.is_file() and BUILT in self.stages.read_text(encoding="utf-8"))
 
     def start(self) -> None:
-        """Start the process in its own process group, so that Ctrl-C reaches it only through the pool."""
+        """Start the process; Ctrl-C reaches it only through the pool."""
         make_folder(self.output.parent)
         self.stages.unlink(missing_ok=True)
-        with self.output.open("wb") as output:
-            environment = child_environment() | {STAGES_FILE: str(self.stages)}
-            self.process = Popen(
-                self.command, stdin=DEVNULL, stdout=output, stderr=STDOUT, env=environment, start_new_session=True
-            )
+        self.process = start_apart(self.command, self.output, **{STAGES_FILE: str(self.stages)})
 
     def tell(self, number: int) -> None:
         """Send a signal to the process and to its child processes."""

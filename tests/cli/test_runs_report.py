@@ -7,9 +7,7 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,22 +21,18 @@ from legged.cli.runs import runs as table
 from legged.cli.train import train
 from legged.errors import RunError
 from legged.evaluation.learning_curves import read_scalars, smooth
-from legged.evaluation.reports import run_report
 from legged.evaluation.reports.record import read_record
 from legged.evaluation.reports.run_report import over_training, write_report
 from legged.learning.captured import CapturedRunner
 from legged.learning.invocation import INVOCATION_FILE
+from legged.learning.report_process import LOG, NICENESS, STARTED, wait_for_reports
 from legged.learning.timing import TIMING_FILE
+from legged.process import processes
 
 pytestmark = [pytest.mark.usefixtures("workplace"), pytest.mark.slow]
 
 REPORTED = ["train.runner.report=true", "train.runner.film=false", "env.episode_length_s=0.1"]
 FLAGS = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
-
-
-def instead_of_processes(start) -> SimpleNamespace:
-    """What stands for the module subprocess, with another `Popen`."""
-    return SimpleNamespace(Popen=start, DEVNULL=subprocess.DEVNULL)
 
 
 def read(folder: Path, name: str = "report.html") -> str:
@@ -122,6 +116,7 @@ def test_a_training_that_raises_leaves_a_report_that_says_so(monkeypatch):
     monkeypatch.setattr(CapturedRunner, "_log", fail)
     with pytest.raises(RuntimeError, match="good"):
         train.main([*FLAGS, *REPORTED, "--max_iterations", "3"])
+    wait_for_reports()
     (folder,) = run_folders()
     assert '<span class="badge crashed">' in read(folder)
     assert "after 1 of 3 iterations: RuntimeError: no &lt;good&gt;" in read(folder)
@@ -141,23 +136,15 @@ def test_a_run_that_wrote_no_end_gets_its_report_later(capsys):
     assert "velocity error [m/s]" in read(folder)
 
 
-def test_a_report_that_fails_spoils_no_run(monkeypatch, capsys):
-    def fail(folder):
-        raise ValueError("two\nlines")
+def test_a_report_that_cannot_be_started_spoils_no_run(monkeypatch, capsys):
+    def fail(*_, **__):
+        raise OSError("no such program")
 
-    monkeypatch.setattr(run_report, "write_report", fail)
-    arguments = [*FLAGS, *REPORTED, "--max_iterations", "1"]
-    assert train.main(arguments) == 0
+    monkeypatch.setattr(processes, "Popen", fail)
+    assert train.main([*FLAGS, *REPORTED, "--max_iterations", "1"]) == 0
     (folder,) = run_folders()
-    assert capsys.readouterr().err == f"warning: {folder}: no report: two lines\n"
+    assert capsys.readouterr().err == f"warning: {folder}: no report: no such program\n"
     assert (folder / "model_0.pt").is_file()
-
-    def interrupt(folder):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(run_report, "write_report", interrupt)
-    assert train.main(arguments) == 0
-    assert "interrupted before its report was written" in capsys.readouterr().err
 
 
 def test_a_training_that_wants_none_has_none():
@@ -212,34 +199,29 @@ class Started:
     def __init__(self, command, **options):
         self.command, self.options = command, options
 
-    def poll(self):
-        return None
 
-
-def test_a_film_is_asked_of_another_process_and_the_report_is_there_before(monkeypatch, capsys):
+@pytest.mark.parametrize("film", [True, False])
+def test_a_report_is_asked_of_another_process(film, monkeypatch, capsys):
     monkeypatch.setenv("RANK", "0")
-    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(Started))
-    monkeypatch.setattr(run_report.os, "setpriority", lambda *given: niceness.append(given))
-    monkeypatch.setattr(run_report, "FILMING", [])
+    monkeypatch.setattr(processes, "Popen", Started)
+    monkeypatch.setattr(os, "setpriority", lambda *given: niceness.append(given))
     niceness = []
-    assert train.main([*FLAGS, "--max_iterations", "1", "train.runner.report=true"]) == 0
-    (folder,) = run_folders()
-    (asked,) = run_report.FILMING
-    assert asked.command[1:] == ["-m", "legged", "runs", "report", str(folder), "--film"]
+    more = ["train.runner.report=true", f"train.runner.film={film}"]
+    Path("mine.py").write_text("")
+    assert train.main([*FLAGS, "--max_iterations", "1", "--import", "mine.py", *more]) == 0
+    (folder,), asked = run_folders(), STARTED.pop()
+    assert asked.command[1:] == ["-m", "legged", "runs", "report", str(folder), *["--film"] * film, "--import", "mine.py"]
     assert (asked.options["env"]["CUDA_VISIBLE_DEVICES"], "RANK" in asked.options["env"]) == ("", False)
     assert asked.options["start_new_session"]  # Ctrl-C and a terminal that closes are none of its business
-    assert niceness == [(os.PRIO_PROCESS, 0, run_report.NICENESS)]
-    assert "Run" in read(folder)
+    assert niceness == [(os.PRIO_PROCESS, 0, NICENESS)]
     last = capsys.readouterr().out.splitlines()[-1]
-    assert re.fullmatch(rf"report {folder}/report.html \(\d+\.\d s; a film follows, or film.log says why not\)", last)
+    assert last == f"report follows: {folder}/report.html (report.log says why if it does not)"
 
 
 def test_the_other_process_writes_why_there_is_no_film_and_leaves_the_report_whole(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     folder = tiny_run("train.runner.report=true", iterations=1)
-    process = run_report.FILMING[-1]
-    assert process.wait() == 0
-    assert read(folder, run_report.LOG).startswith("no film: cannot render here")
+    assert read(folder, LOG).startswith(f"written: {folder}/report.html\nno film: cannot render here")
     assert read(folder).rstrip().endswith("</html>")
     assert not list(folder.glob(".*"))
 
@@ -251,30 +233,19 @@ def test_a_run_that_is_deleted_before_it_is_filmed_stays_deleted(monkeypatch, ca
 
     folder = tiny_run(iterations=1)
     monkeypatch.setattr("legged.cli.runs.film", film)
-    assert report.main([str(folder), "--film"]) == 2
-    assert str(folder) in capsys.readouterr().err
+    assert report.main([str(folder), "--film"]) == 0
+    assert "no film: the run folder was removed\n" in capsys.readouterr().out
     assert not folder.exists()
-
-
-@pytest.mark.parametrize(
-    ("why", "words"),
-    [("MUJOCO_GL: 'egl' does not work", "no film: nothing can be drawn"), ("", "no film: no such program")],
-)
-def test_without_a_film_there_is_a_report_and_a_line(why, words, monkeypatch, capsys):
-    def fail(*_, **__):
-        raise OSError("no such program")
-
-    monkeypatch.setattr(run_report.headless, "NO_PICTURES", why)
-    monkeypatch.setattr(run_report, "subprocess", instead_of_processes(fail))
-    arguments = [*FLAGS, "--max_iterations", "1", "train.runner.report=true"]
-    assert train.main(arguments) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert re.fullmatch(rf"report logs/{TASK}/[-\d_]+/report.html \(\d+\.\d s; {words}\)", last)
 
 
 def test_the_command_films(monkeypatch, capsys):
     frames = [np.full((32, 32, 3), shade, dtype=np.uint8) for shade in (0, 90, 180)]
-    monkeypatch.setattr("legged.cli.runs.film", lambda policy, side: frames)
+
+    def film(policy, side):
+        assert read(folder).rstrip().endswith("</html>"), "a film that ends the process leaves no report"
+        return frames
+
+    monkeypatch.setattr("legged.cli.runs.film", film)
     folder = tiny_run(iterations=1)
     assert report.main([str(folder), "--film"]) == 0
     assert f"written: {folder / 'film.gif'}" in capsys.readouterr().out

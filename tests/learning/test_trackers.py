@@ -118,12 +118,13 @@ def test_weights_and_biases_get_what_tensorboard_gets_and_the_files_of_the_run(m
 
 @pytest.mark.slow
 def test_a_writer_of_one_s_own_stands_beside_tensorboard():
-    folder = tiny_run(own_tracker(), iterations=2)
+    folder = tiny_run(own_tracker(), "train.runner.report=true", "train.runner.film=false", iterations=2)
     lines = Path("lines.txt").read_text().splitlines()
     assert lines[0].startswith(f"config {TASK} 0.001")
     assert "scalar Loss/value 1" in lines
     assert [line for line in lines if line.startswith("model")] == ["model model_0.pt 0", "model model_1.pt 1"]
-    assert lines[-4:] == ["file config.yaml", "file code.diff", "file timing.json", "stop"]
+    files = ["config.yaml", "code.diff", "timing.json", "report.html", "report.md"]
+    assert lines[-6:] == [*(f"file {name}" for name in files), "stop"]
     assert scalars(folder)["Loss/value"] == [0, 1]
 
 

@@ -22,14 +22,17 @@ def run(code: str, *arguments: str, cwd: Path | None = None) -> str:
     return done.stdout
 
 
-def test_a_training_does_without_the_compiler(tmp_path):
+def test_a_training_does_without_the_compiler_and_without_what_writes_its_report(tmp_path):
     settings = ["--task", "anymal_c_flat", "--sim_device", "cpu", "--num_envs", "2", "--max_iterations", "1", "sim.threads=1"]
     settings.append("train.runner.film=false")
     code = (
         f"{AS_A_COMMAND}sys.argv += {settings!r}\n"
         "from legged.cli.train import train\n"
         "assert train.main() == 0\n"
-        "print([name for name in ('torch._dynamo.utils', 'torch._inductor', 'sympy') if name in sys.modules])\n"
+        "from legged.learning.report_process import wait_for_reports\n"
+        "wait_for_reports()\n"
+        "print([name for name in ('torch._dynamo.utils', 'torch._inductor', 'sympy', 'legged.evaluation.reports.document',"
+        " 'legged.evaluation.reports.run_report') if name in sys.modules])\n"
     )
     assert run(code, cwd=tmp_path).splitlines()[-1] == "[]"
 

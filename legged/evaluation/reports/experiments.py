@@ -10,9 +10,9 @@ from legged.config.dotted import value_at
 from legged.evaluation.learning_curves import smooth
 from legged.evaluation.reports.document import Cell, Link, Mono, Number, Paragraph, Part, Table, number, text_of
 from legged.evaluation.reports.record import Record, but_for_seeds, what_changed
-from legged.evaluation.reports.run_report import REPORT
 from legged.evaluation.result_file import tracking_of
 from legged.evaluation.success import types_in
+from legged.learning.run_folder import REPORT
 
 TITLE = "Experiments"
 EMPTY = ("", "-")

@@ -1,11 +1,6 @@
 """The report on one run: report.html, which is self-contained, and report.md with its pictures."""
 
-import os
 import shlex
-import subprocess
-import sys
-import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -37,22 +32,13 @@ from legged.evaluation.success import success_charts
 from legged.evaluation.velocity_grid import AXES
 from legged.evaluation.velocity_tracking import PANELS, grid_means
 from legged.learning.invocation import Invocation
-from legged.learning.run_folder import BEST_MODEL, CODE_FILE, checkpoints
-from legged.process import headless
+from legged.learning.run_folder import BEST_MODEL, CODE_FILE, REPORT, checkpoints
 from legged.process.paths import relative
-from legged.process.processes import child_environment
 
-REPORT = "report"
-"""Name of the report's files, before their ending."""
 ROWS = 10
 """Number of rows of the table that shows figures over the training."""
 LARGEST_FILM = 12 * 2**20
 """Size of the largest film that the report shows [bytes]. For a larger film the report gives only the file name."""
-LOG = "film.log"
-"""Name of the file in a run folder with the output of the process that films the policy."""
-NICENESS = 10
-FILMING: list[subprocess.Popen] = []
-"""Filming processes that this process has started."""
 LONGEST_DIFF = 200_000
 """Largest number of letters of a code diff in the page; CODE_FILE holds the whole diff."""
 ON_GRID = (
@@ -253,49 +239,3 @@ def _episodes(label: str, episodes: dict[str, Any]) -> list[Part]:
         Paragraph(f"{episodes['count']:.0f} full episodes without noise, in {label}."),
         Table(["measure", "mean", "standard deviation", "least", "greatest"], rows),
     ]
-
-
-# ---- after a training --------------------------------------------------------------------------------------------------
-
-
-def report_at_end(folder: Path, film_with: Sequence[str] | None) -> None:
-    """Write the report on a run that has just ended, and print its path. A failure prints one line and raises no error,
-    because the run itself is complete.
-
-    If `film_with` is given, a second process films the policy and writes the report again with the film. `film_with` holds
-    command-line options with which the second process finds the run's task. The film has its own process because a failing
-    graphics driver may end or block a process. The second process writes to LOG in the run folder; nothing waits for it.
-    """
-    start = time.perf_counter()
-    try:
-        page = write_report(folder)
-        film = "" if film_with is None else f"; {_film_apart(folder, film_with)}"
-    except KeyboardInterrupt:
-        print(f"{relative(folder)}: interrupted before its report was written", file=sys.stderr, flush=True)
-    except Exception as error:  # a report that fails must not make the run fail
-        said = " ".join(str(error).split())[:300] or type(error).__name__
-        print(f"warning: {relative(folder)}: no report: {said}", file=sys.stderr, flush=True)
-    else:
-        print(f"report {relative(page)} ({time.perf_counter() - start:.1f} s{film})", flush=True)
-
-
-def _film_apart(folder: Path, options: Sequence[str]) -> str:
-    """Start another process that films the policy; return words about the film for the printed line."""
-    if headless.NO_PICTURES:
-        return "no film: nothing can be drawn"
-    command = [sys.executable, "-m", "legged", "runs", "report", str(folder), "--film", *options]
-    alone = {key: text for key, text in child_environment().items() if key not in ("RANK", "LOCAL_RANK", "WORLD_SIZE")}
-    alone["CUDA_VISIBLE_DEVICES"] = ""  # the film is drawn on the CPU, because a GPU's memory may be full
-    alone["LP_NUM_THREADS"] = "1"  # number of threads of Mesa, which draws without a GPU
-    FILMING[:] = [process for process in FILMING if process.poll() is None]
-    try:
-        with (folder / LOG).open("wb") as log:
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=alone, start_new_session=True
-            )
-        if hasattr(os, "setpriority"):
-            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
-    except OSError as error:
-        return f"no film: {error}"
-    FILMING.append(process)
-    return f"a film follows, or {LOG} says why not"
