@@ -291,7 +291,8 @@ class _Training:
         print(
             f"{'finished' if finished else 'stopped'} after {runner.current_learning_iteration + 1} iterations: "
             f"{timing.steps:,} steps in {timing.loop_s:.1f} s of training loop ({timing.steps_per_s:,.0f} steps/s"
-            f"{timing.company}), {timing.start_up_s:.1f} s of start-up (with imports and kernel compilation)\n"
+            f"{timing.company}), {timing.start_up_s:.1f} s of start-up (with imports and kernel compilation), "
+            f"{timing.wall_s:.1f} s in all\n"
             f"checkpoint in {relative(folder)}; see it walk: {play_command(self.args, self.cfg, folder)}",
             flush=True,
         )

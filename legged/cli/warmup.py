@@ -5,6 +5,7 @@ import time
 
 from legged.commandline.arguments import TASK, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import sub_command
+from legged.config.networks import learns_from_teacher
 from legged.physics import kernel_cache, resolve_physics
 from legged.registry import make_task, task_config
 
@@ -13,8 +14,9 @@ from legged.registry import make_task, task_config
 def warmup(args: argparse.Namespace) -> int:
     """Compile and cache the kernels of a task: `legged warmup anymal_c`.
 
-    The task is built as `legged train` builds it with the same arguments. Warp's cache then holds all kernels of the task for
-    this device, and the next training starts without compiling. C MuJoCo compiles no kernels.
+    The task is built as `legged train` builds it with the same arguments, and on a GPU the networks are updated once. The
+    caches of Warp and Triton then hold all kernels of the task for this device, and the next training starts without
+    compiling. C MuJoCo compiles no kernels.
     """
     register_given(args, "task")
     device = pick_device(args.sim_device)
@@ -23,6 +25,10 @@ def warmup(args: argparse.Namespace) -> int:
         print(f"{cfg.task}: nothing to do, because C MuJoCo compiles no kernels")
         return 0
     settle_on(device)
-    make_task(cfg, device, graph=not args.no_graph)
+    task = make_task(cfg, device, graph=not args.no_graph)
+    if task.captured and cfg.train.runner.loop == "captured" and not learns_from_teacher(cfg):
+        from legged.learning.captured import CapturedRunner  # imported late; a CPU needs no learner here
+
+        CapturedRunner(task, None, str(device)).compile_kernels()
     print(f"{cfg.task}: ready in {time.perf_counter() - args.start_s:.1f} s; its kernels are in {kernel_cache()}")
     return 0

@@ -111,6 +111,12 @@ class CapturedRunner(Runner):
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
             self.logger.stop_logging_writer()
 
+    def compile_kernels(self) -> None:
+        """Make a trial rollout and a trial update, so that their kernels are compiled and cached."""
+        if not self.why_stock:
+            self.alg.train_mode()
+            self._capture(self._steps(), False)
+
     @property
     def _runs_ahead(self) -> bool:
         """True if the next iteration is launched before the previous one is logged. With several processes it is False,

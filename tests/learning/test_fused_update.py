@@ -207,6 +207,19 @@ def test_the_value_function_learns_alone():
 
 
 @pytest.mark.slow
+def test_processes_with_equal_gradients_learn_like_one(monkeypatch):
+    """The average over two processes replaces the gradient, the sums of losses, and the squares for clipping."""
+    pair = both(num_learning_epochs=1)
+    before = parameters(pair[0])
+    alg = pair[1]
+    alg.is_multi_gpu, alg.gpu_world_size = True, 2
+    monkeypatch.setattr(torch.distributed, "all_reduce", lambda gradient: gradient.mul_(2.0))
+    wanted, found = (alg.update() for alg in pair)
+    assert distance(pair, before) < 1e-5
+    assert found == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.slow
 def test_checkpoints_are_exchanged():
     """Kernels go on where autograd stopped, and the other way round."""
     found = []

@@ -36,10 +36,12 @@ def test_numbers_are_those_that_are_printed(capsys):
     assert train.main(arguments) == 0
     (folder,) = run_folders()
     said = json.loads((folder / TIMING_FILE).read_text())
+    printed = capsys.readouterr().out
     assert (
         f"finished after 1 iterations: {said['steps']} steps in {said['loop_s']:.1f} s of training loop"
-        f" ({said['steps_per_s']:,.0f} steps/s), {said['start_up_s']:.1f} s of start-up" in capsys.readouterr().out
+        f" ({said['steps_per_s']:,.0f} steps/s), {said['start_up_s']:.1f} s of start-up" in printed
     )
+    assert f"{said['wall_s']:.1f} s in all" in printed
 
 
 def test_what_is_written_is_read_again(tmp_path):
