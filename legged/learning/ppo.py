@@ -80,9 +80,8 @@ class DevicePPO(CriticWarmup):
             self.optimizer = torch.optim.Adam(self._optimized(), lr=self._rate, fused=True, capturable=capturable)
             # While found_inf is 1, a fused step leaves the parameters, the moments and the step count unchanged.
             self.optimizer.found_inf = torch.zeros((), device=self.device)  # type: ignore[attr-defined]
-            if not (reason := why_not(self)):
-                self.use_kernels()
-            elif self._rate.is_cuda:
+            reason = why_not(self) or self.use_kernels()
+            if reason and self._rate.is_cuda:
                 print(f"the update runs without fused kernels: {reason}", flush=True)
             if self.is_multi_gpu and self._fused is None:
                 self._shared = SharedGradients(self._learned, self.gpu_world_size)
@@ -108,12 +107,18 @@ class DevicePPO(CriticWarmup):
     fits_graph = True
     """True if a CUDA graph can capture an update. Features that can't be captured use rsl-rl's own loop."""
 
-    def use_kernels(self, kind: torch.dtype = torch.float16) -> None:
-        """Compute updates by Triton kernels, whose products have operands of type `kind`."""
-        from legged.learning.fused_update.update import FusedUpdate  # this imports Triton, which a CPU need not have
+    def use_kernels(self, kind: torch.dtype = torch.float16) -> str:
+        """Compute updates by Triton kernels, whose products have operands of type `kind`. If Triton fails on this machine,
+        return a text that says why; else an empty text.
+        """
+        from legged.learning.fused_update.update import FAILURES, FusedUpdate  # these import Triton
 
         assert self._rate is not None
-        self._fused = FusedUpdate(self, self._rate, (LOWEST_RATE, HIGHEST_RATE, RATE_STEP), kind)
+        try:
+            self._fused = FusedUpdate(self, self._rate, (LOWEST_RATE, HIGHEST_RATE, RATE_STEP), kind)
+        except FAILURES as error:
+            return f"Triton fails here: {' '.join(str(error).split())[:200]}"
+        return ""
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
         """Set the object that measures estimation errors, and the learning rate of the actor's estimator. Call this once,

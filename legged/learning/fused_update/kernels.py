@@ -70,24 +70,17 @@ def forward(h, weight, bias, unit, to, IN: tl.constexpr, OUT: tl.constexpr, ACTI
 
 
 @triton.jit
-def backward(d, weight, h, largest, to, SCALED: tl.constexpr, IN: tl.constexpr, OUT: tl.constexpr,
-             ROWS: tl.constexpr, COLUMNS: tl.constexpr, DEPTH: tl.constexpr):  # fmt: skip
-    """Write d W * elu'(h) to `to` (rows, IN). `d` is (rows, OUT), `h` (rows, IN). One program per tile.
-
-    If SCALED, `d` is multiplied by the factor of its largest number first.
-    """
+def backward(d, weight, h, to, IN: tl.constexpr, OUT: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
+             DEPTH: tl.constexpr):  # fmt: skip
+    """Write d W * elu'(h) to `to` (rows, IN). `d` is (rows, OUT), `h` (rows, IN). One program per tile."""
     tiles: tl.constexpr = IN // COLUMNS
     row = (tl.program_id(0) // tiles) * ROWS + tl.arange(0, ROWS)
     out = (tl.program_id(0) % tiles) * COLUMNS + tl.arange(0, COLUMNS)
     inner = tl.arange(0, DEPTH)
     left, right = d + row[:, None] * OUT + inner[None, :], weight + inner[:, None] * IN + out[None, :]
-    multiplier = factor_of(tl.load(largest))
     total = tl.zeros([ROWS, COLUMNS], tl.float32)
     for k in range(0, OUT, DEPTH):
-        gradient = tl.load(left + k)
-        if SCALED:
-            gradient = gradient * multiplier
-        total = tl.dot(gradient.to(weight.dtype.element_ty), tl.load(right + k * IN), total, input_precision="ieee")
+        total = tl.dot(tl.load(left + k), tl.load(right + k * IN), total, input_precision="ieee")
     at = row[:, None] * IN + out[None, :]
     value = tl.load(h + at).to(tl.float32)
     tl.store(to + at, (total * tl.where(value > 0.0, 1.0, value + 1.0)).to(to.dtype.element_ty))
@@ -173,12 +166,19 @@ def critic_loss(value, order, old_value, returns, gradient, largest, sums, sampl
 
 
 @triton.jit
-def weights(d, h, largest, unit, to, bias, part, rows, rows_each, SCALED: tl.constexpr, IN: tl.constexpr, OUT: tl.constexpr,
-            ROWS: tl.constexpr, COLUMNS: tl.constexpr, DEPTH: tl.constexpr):  # fmt: skip
+def scale(d, largest, to, BLOCK: tl.constexpr):
+    """Write d, times the factor of its `largest` number, to `to`."""
+    at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    tl.store(to + at, (tl.load(d + at) * factor_of(tl.load(largest))).to(to.dtype.element_ty))
+
+
+@triton.jit
+def weights(d, h, unit, to, bias, part, rows, rows_each, IN: tl.constexpr, OUT: tl.constexpr, ROWS: tl.constexpr,
+            COLUMNS: tl.constexpr, DEPTH: tl.constexpr):  # fmt: skip
     """Write partial sums of d^T h * unit to `to`, and of the rows of d to `bias`. `d` is (rows, OUT), `h` (rows, IN).
 
     The first axis of the grid is the tile of the weights, the second the part of the rows. A part has `rows_each` rows; their
-    sums are `part` numbers apart. If SCALED, `d` is multiplied by the factor of its largest number first.
+    sums are `part` numbers apart.
 
     The rows of d are summed by a product with ones. If the loaded d had another use than products, Triton 3.6 would give it
     too few buffers, and loads would overwrite what a product still reads.
@@ -189,13 +189,10 @@ def weights(d, h, largest, unit, to, bias, part, rows, rows_each, SCALED: tl.con
     start = tl.program_id(1) * rows_each
     row = start + tl.arange(0, DEPTH)
     left, right = d + row[:, None] * OUT + out[None, :], h + row[:, None] * IN + into[None, :]
-    multiplier = factor_of(tl.load(largest))
     total, sums = tl.zeros([ROWS, COLUMNS], tl.float32), tl.zeros([ROWS, 16], tl.float32)
     ones = tl.full([DEPTH, 16], 1.0, h.dtype.element_ty)
     for _ in range(start, tl.where(start + rows_each < rows, start + rows_each, rows), DEPTH):
         gradient = tl.load(left)
-        if SCALED:
-            gradient = (gradient * multiplier).to(h.dtype.element_ty)
         total = tl.dot(gradient.T, tl.load(right), total, input_precision="ieee")
         sums = tl.dot(gradient.T, ones, sums, input_precision="ieee")
         left += DEPTH * OUT

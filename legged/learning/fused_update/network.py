@@ -53,7 +53,10 @@ class Network:
         kinds = [*[kind] * (len(layers) - 1), torch.float32]
         self.inputs = torch.zeros(batches, rows, layers[0].inputs, dtype=kind, device=device)
         self.outputs = [torch.zeros(rows, la.outputs, dtype=k, device=device) for la, k in zip(layers, kinds, strict=True)]
-        self.gradients = [torch.zeros_like(output) for output in self.outputs]
+        self.by_outputs = torch.zeros_like(self.outputs[-1])
+        """Gradient by the last outputs (rows, outputs), as the losses give it."""
+        self.gradients = [torch.zeros_like(output, dtype=kind) for output in self.outputs]
+        """Gradients by the outputs of all layers, multiplied by the factor of the largest number of `by_outputs`."""
         parts = [parts_of(layer, rows) for layer in layers for _ in range(layer.weight, layer.end, BLOCK)]
         self.parts = torch.tensor(parts, dtype=torch.int32, device=device)
         """Number of parts of each block of parameters."""
@@ -96,21 +99,21 @@ class Network:
         """Compute the gradients by all layers' outputs and parameters from the gradient by the last outputs, whose largest
         number is `largest`.
         """
+        kernels.scale[(self.by_outputs.numel() // 1024,)](self.by_outputs, largest, self.gradients[-1], 1024)
         for i in reversed(range(len(self.layers))):
             layer, d = self.layers[i], self.gradients[i]
-            last = i == len(self.layers) - 1
             h, unit = (self.outputs[i - 1], self.one) if i else (self.inputs[batch], self.unit)
             rows, columns = gradient_tile(layer)
             parts = parts_of(layer, self.rows)
             rows_each = ROWS * -(-self.rows // (ROWS * parts))
             kernels.weights[(layer.outputs // rows * (layer.inputs // columns), parts)](
-                d, h, largest, unit, self.partial[0, layer.weight - self.start :], self.partial[0, layer.bias - self.start :],
-                self.size, self.rows, rows_each, last, layer.inputs, layer.outputs, rows, columns, ROWS,
+                d, h, unit, self.partial[0, layer.weight - self.start :], self.partial[0, layer.bias - self.start :],
+                self.size, self.rows, rows_each, layer.inputs, layer.outputs, rows, columns, ROWS,
             )  # fmt: skip
             if i:
                 rows, columns = row_tile(layer.inputs)
                 kernels.backward[(self.rows // rows * (layer.inputs // columns),)](
-                    d, shadow[layer.weight :], h, largest, self.gradients[i - 1], last, layer.inputs, layer.outputs,
+                    d, shadow[layer.weight :], h, self.gradients[i - 1], layer.inputs, layer.outputs,
                     rows, columns, tile(layer.outputs, DEPTH), num_stages=2,
                 )  # fmt: skip
 

@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Sequence
+from subprocess import CalledProcessError
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
+from triton.errors import TritonError
 
 from legged.graph.step_graph import Branch
 from legged.learning.fused_update import kernels
@@ -14,6 +16,10 @@ from legged.learning.fused_update.network import ROWS, Network, linear_layers
 
 if TYPE_CHECKING:
     from legged.learning.ppo import DevicePPO
+
+
+FAILURES = (RuntimeError, CalledProcessError, TritonError)
+"""Errors of Triton if it finds no C compiler, or if a kernel does not fit the GPU."""
 
 
 class FusedUpdate:
@@ -27,7 +33,10 @@ class FusedUpdate:
         self, alg: "DevicePPO", rate: Tensor, rates: tuple[float, float, float], kind: torch.dtype = torch.float16
     ) -> None:
         """Take the learner; its learning `rate` () on the device; the lowest and highest rate, and the factor of an
-        adaptation; and the type of the operands of products.
+        adaptation; and the type of the operands of products. All kernels are launched once, on zeros.
+
+        Raises:
+            One of FAILURES: Triton can't compile or launch a kernel. The learner is unchanged then.
         """
         self.alg, self.rate, self._rates = alg, rate, rates
         device, storage = rate.device, alg.storage
@@ -43,8 +52,6 @@ class FusedUpdate:
         self.shadow = zeros(layout.size, dtype=kind)
         self.steps = zeros(2)
         """Numbers of Adam's steps of actor and critic."""
-        self._adopt(linears)
-
         self.images = 2 if alg.symmetry else 1
         self.samples = storage.actions[..., 0].numel() // alg.num_mini_batches
         self.rows_used = self.samples * self.images
@@ -64,6 +71,18 @@ class FusedUpdate:
 
         self._mirror_actions = self._mirror_table([])
         self._mirror_inputs = [self._mirror_table(model.obs_groups) for model in self.models]
+        self._launch_all()
+        self._adopt(linears)
+
+    def _launch_all(self) -> None:
+        """Take a step with parameters that are 0, so that all kernels are compiled. Undo it afterwards."""
+        before = self.rate.clone()
+        losses = torch.zeros(6, device=self.rate.device)
+        self.learn(0, False, losses)
+        self._step(0, torch.zeros(self.samples, dtype=torch.int64, device=self.rate.device), False, losses)
+        self.rate.copy_(before)
+        for tensor in (self.vector, self.first, self.second, self.steps):
+            tensor.zero_()
 
     def _adopt(self, linears: list[list[nn.Linear]]) -> None:
         """Turn parameters and moments into views of the vectors, with their values."""
@@ -142,17 +161,17 @@ class FusedUpdate:
 
     def _actor_loss(self, network: "Network", order: Tensor) -> None:
         st, columns = self.alg.storage, self.columns
-        old_mean, old_std = st.distribution_params
+        old_mean, old_std = st.distribution_params or (st.actions, st.actions)  # there are none before the first rollout
         kernels.actor_loss[(self.rows // ROWS,)](
             network.outputs[-1], order, st.actions, *self._mirror_actions, st.actions_log_prob, st.advantages,
-            old_mean, old_std, self.vector[self.layout.std :], network.gradients[-1], self.largest, self.sums, self.samples,
+            old_mean, old_std, self.vector[self.layout.std :], network.by_outputs, self.largest, self.sums, self.samples,
             self.alg.clip_param, self.images, self.actions, columns, ROWS,
         )  # fmt: skip
 
     def _critic_loss(self, network: "Network", order: Tensor) -> None:
         st, alg = self.alg.storage, self.alg
         kernels.critic_loss[(self.rows // ROWS,)](
-            network.outputs[-1], order, st.values, st.returns, network.gradients[-1], self.largest[1], self.sums,
+            network.outputs[-1], order, st.values, st.returns, network.by_outputs, self.largest[1], self.sums,
             self.samples, alg.clip_param, alg.value_loss_coef, alg.use_clipped_value_loss, self.images,
             network.layers[-1].outputs, self.sums.shape[1], ROWS,
         )  # fmt: skip
