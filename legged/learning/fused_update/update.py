@@ -161,7 +161,8 @@ class FusedUpdate:
 
     def _actor_loss(self, network: "Network", order: Tensor) -> None:
         st, columns = self.alg.storage, self.columns
-        old_mean, old_std = st.distribution_params or (st.actions, st.actions)  # there are none before the first rollout
+        # The storage has no parameters of a policy before the first rollout.
+        old_mean, old_std = st.distribution_params or (st.actions, st.actions)
         kernels.actor_loss[(self.rows // ROWS,)](
             network.outputs[-1], order, st.actions, *self._mirror_actions, st.actions_log_prob, st.advantages,
             old_mean, old_std, self.vector[self.layout.std :], network.by_outputs, self.largest, self.sums, self.samples,
