@@ -36,7 +36,10 @@ LONGEST_DEFAULT = 60
 """Characters of a default that stand in the table; longer ones follow the meaning."""
 API = {
     "legged_robot": ("legged.envs.LeggedRobot", {"inherited_members": False}),
-    "terms": ("legged.envs.terms.Terms", {"filters": ["!^_", "^_(reward|obs|terminate|metric)_"]}),
+    "terms": (
+        "legged.envs.velocity_terms.VelocityTerms",
+        {"inherited_members": True, "filters": ["!^_", "^_(reward|obs|terminate|metric)_"]},
+    ),
     "base_task": ("legged.envs.BaseTask", {}),
     "registry": ("legged.registry", {"members": ["register", "register_file", "task_config", "make_task", "task_class"]}),
     "physics": ("legged.physics.Physics", {}),

@@ -16,7 +16,7 @@ from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.loader import Registered, Rescale, class_hints
 from legged.config.networks import groups_in
 from legged.config.rescale import rescale
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, LeggedRobot, RobotTask
 from legged.envs.marks import unit_of
 from legged.errors import ConfigError, suggest
 from legged.gymnasium_ids import add_ids
@@ -165,9 +165,9 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
     """Return the configuration schema of a task class.
 
     Raises:
-        ConfigError: `Config` is not a frozen dataclass that extends the schema of LeggedRobot or BaseTask.
+        ConfigError: `Config` is not a frozen dataclass that extends the schema of RobotTask or BaseTask.
     """
-    base, schema = (LeggedRobot if issubclass(kind, LeggedRobot) else BaseTask).Config, kind.Config
+    base, schema = (RobotTask if issubclass(kind, RobotTask) else BaseTask).Config, kind.Config
     # Without @dataclass, the fields that a class adds would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):
@@ -242,7 +242,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
         return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without a unit
 
     def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
-        if not issubclass(kind, LeggedRobot):
+        if not issubclass(kind, RobotTask):
             raise ConfigError(f"{where}: a task of {kind.__name__} has no robot to which numbers could be rescaled")
         reference = size_of(reference_robot, where)
         if not robot or robot == reference_robot:

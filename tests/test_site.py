@@ -119,7 +119,7 @@ PAGES = {
     "tasks": "robots",
     "commands": "legged-completion",
     "legged_robot": "legged.envs.LeggedRobot.hold_commands",
-    "terms": "legged.envs.terms.Terms._reward_tracking_lin_vel",
+    "terms": "legged.envs.velocity_terms.VelocityTerms._reward_tracking_lin_vel",
     "base_task": "legged.envs.BaseTask.step",
     "registry": "legged.registry.register",
 }

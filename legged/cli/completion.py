@@ -10,7 +10,7 @@ import shtab
 from legged.cli.main import COMMANDS, load
 from legged.commandline.command import sub_command
 from legged.config.reference import fields
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, RobotTask
 from legged.physics.fields import FIELDS
 from legged.process.command_parser import argument
 from legged.process.paths import data_folder
@@ -104,7 +104,7 @@ def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
             "observations.noise": kind.terms("_obs_"),
             "domain_rand.ranges": FIELDS,
         }
-        if issubclass(kind, LeggedRobot):
+        if issubclass(kind, RobotTask):
             entries |= {"terrain.proportions": TERRAIN_TYPES, "terrain.sizes": TERRAIN_TYPES}
         for text in fields(kind.Config):
             if not text.is_section:

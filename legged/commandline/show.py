@@ -10,7 +10,7 @@ import torch
 from legged.config import TaskConfig, override
 from legged.config.networks import groups_in
 from legged.config.schema import DrawConfig, LeggedDomainRandConfig
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, RobotTask
 from legged.mdp.control import action_scales
 from legged.mdp.distributions import standard_deviation
 from legged.physics import FIELDS
@@ -56,7 +56,7 @@ _number = "{:.6g}".format
 
 def _robot(task: BaseTask) -> Iterator[str]:
     """Yield the size of a legged robot, and the factors by which settings written for another robot are rescaled."""
-    if not isinstance(task, LeggedRobot):
+    if not isinstance(task, RobotTask):
         return
     size = Size(task.robot.mass, task.robot.height)
     line = f"robot: {task.robot.name}, {size.mass:.4g} kg, {size.height:.3g} m high"
@@ -158,7 +158,7 @@ def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
 def _actions(task: BaseTask) -> Iterator[str]:
     model, clip = task.physics.model, task.cfg.control.clip_actions
     rows = [("action", "actuator", "what it does")]
-    acted = list(task.control.acted) if isinstance(task, LeggedRobot) else list(range(task.num_actions))
+    acted = list(task.control.acted) if isinstance(task, RobotTask) else list(range(task.num_actions))
     for i in range(model.nu):
         rows.append((str(acted.index(i)) if i in acted else "-", model.actuator(i).name or f"({i})", _effect(task, i)))
     yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", *rows)
@@ -175,7 +175,7 @@ def _effect(task: BaseTask, i: int) -> str:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])
     joint = model.joint(number).name or f"({number})"
-    if not isinstance(task, LeggedRobot):
+    if not isinstance(task, RobotTask):
         force = float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0])
         middle = float(task.control_middle[i]) * force
         slides = model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE

@@ -3,5 +3,6 @@
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_robot import LeggedRobot
 from legged.envs.marks import concurrent, unit
+from legged.envs.robot_task import RobotTask
 
-__all__ = ["BaseTask", "LeggedRobot", "concurrent", "unit"]
+__all__ = ["BaseTask", "LeggedRobot", "RobotTask", "concurrent", "unit"]

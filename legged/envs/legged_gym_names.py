@@ -338,7 +338,15 @@ class LeggedGymNames:
             return kept
         raise AttributeError(f"is not there; {ABSENT[name]}")
 
-    def store_substep(self) -> None:
+    def apply_control(self) -> None:
+        self._store_substep()
+        super().apply_control()  # type: ignore[misc]
+
+    def advance(self) -> None:
+        super().advance()  # type: ignore[misc]
+        self._store_substep()
+
+    def _store_substep(self) -> None:
         """Append the values of names in `SUBSTEPS` that a term has read, and drop those of the oldest physics step."""
         for name in vars(self).get("_kept_names", ()):
             if name in SUBSTEPS:

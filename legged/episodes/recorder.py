@@ -16,7 +16,7 @@ from torch import Tensor
 
 from legged.config import LeggedConfig, TaskConfig, override
 from legged.config.loader import to_dict
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, LeggedRobot, RobotTask
 from legged.envs.final_observation import watch_steps
 from legged.episodes.stored import AXES, FORMAT, Episodes
 from legged.errors import ConfigError
@@ -142,7 +142,7 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
 def _about(task: BaseTask) -> dict[str, Any]:
     """Return the part of the recording's description that depends on the task only."""
     legs: dict[str, Any] = {}
-    if isinstance(task, LeggedRobot):
+    if isinstance(task, RobotTask):
         robot = task.robot
         legs = {
             "robot": robot.name,
@@ -319,7 +319,7 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
     torque [N m], or force [N] of a slide, in either direction. A limit is None if the joint does not have it.
     """
     model = task.physics.model
-    if isinstance(task, LeggedRobot):
+    if isinstance(task, RobotTask):
         robot, turning = task.robot, [True] * len(task.robot.joint_names)
         names, positions, velocities = robot.joint_names, robot.qpos_columns, robot.qvel_columns
         ranges, fastest = np.asarray(robot.dof_pos_limits), robot.dof_vel_limits
@@ -412,7 +412,7 @@ def _control_ranges(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _actions(task: BaseTask) -> tuple[str, ...]:
-    if isinstance(task, LeggedRobot):
+    if isinstance(task, RobotTask):
         return tuple(task.robot.joint_names[i] for i in task.control.acted)
     model = task.physics.model
     return tuple(model.actuator(i).name or f"actuator {i}" for i in range(model.nu))

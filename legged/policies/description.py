@@ -11,7 +11,7 @@ from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.task import TaskConfig
 from legged.deploy.contract import CONTRACT_VERSION, need_of
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, LeggedRobot, RobotTask
 from legged.envs.marks import unit_of
 from legged.mdp.observations import ObservationTerm
 from legged.robots.crouched_pose import crouch
@@ -162,15 +162,15 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
-    if isinstance(task, LeggedRobot) and term.name == "heights":
+    if isinstance(task, RobotTask) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         legged = task.cfg.observations
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
         entry["deepest"] = legged.deepest
         entry["scan"] = task.cfg.terrain.scan
-    if isinstance(task, LeggedRobot) and term.name == "dof_pos" and task.robot.wheels.any():
+    if isinstance(task, RobotTask) and term.name == "dof_pos" and task.robot.wheels.any():
         entry["joints"] = [task.robot.joint_names[i] for i in task.robot.without_wheels]
-    if isinstance(task, LeggedRobot) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
+    if isinstance(task, RobotTask) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry
 

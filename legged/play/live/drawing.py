@@ -11,7 +11,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import srgb_to_linear
 from trimesh.visual.material import PBRMaterial
 
-from legged.envs import LeggedRobot
+from legged.envs import LeggedRobot, RobotTask
 from legged.math import yaw_of
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
@@ -89,7 +89,7 @@ class Drawing:
         self._task = task = self.session.task
         terrain = getattr(task, "terrain", None)
         robots = range(task.num_envs)
-        if isinstance(task, LeggedRobot):
+        if isinstance(task, RobotTask):
             model, sides = robot_spec_of(task.robot.model_path, drawn=True).compile(), camera.size_of(task.robot)
             columns = int(np.ceil(task.num_envs**0.5))
         else:

@@ -1,4 +1,4 @@
-"""Observations, rewards, terminations and metrics of a legged robot, and the tensors that they read.
+"""Observations, rewards and terminations of a robot, whatever its task, and the tensors that they read.
 
 Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If a term differs, its docstring says so.
 """
@@ -14,7 +14,6 @@ from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorKind
-from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.physics import Physics
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
@@ -28,17 +27,15 @@ PENALISED_FORCE = 0.1
 """A contact of a penalised shape is a collision if its force exceeds this multiple of the feet's contact threshold."""
 
 
-class Terms:
-    """Terms of a legged robot: the methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can
-    name, and metrics `_metric_<name>`. N robots, D joints, F feet, B tracked collision shapes. The task allocates the tensors
-    that are declared here.
+class RobotTerms:
+    """Terms of a robot: the methods `_obs_<name>`, `_reward_<name>` and `_terminate_<name>` that a configuration can name.
+    N robots, D joints, F feet, B tracked collision shapes. The task allocates the tensors that are declared here.
     """
 
     MIRRORED: dict[str, MirrorKind] = {
         "base_lin_vel": "vector",
         "base_ang_vel": "rotation",
         "projected_gravity": "vector",
-        "commands": "command",
         "dof_pos": "angles",
         "dof_vel": "joints",
         "actions": "actions",
@@ -86,11 +83,6 @@ class Terms:
     step.
     """
     last_actions: Tensor
-    commands: Tensor
-    """(N, 4) commanded vx, vy [m/s], yaw rate [rad/s] and heading [rad]. `is_moving` (N,) is True if any motion is
-    commanded.
-    """
-    is_moving: Tensor
     feet_pos: Tensor
     """(N, F, 3) positions of the feet in the world frame [m]. `feet_vel` (N, F, 3) are their velocities [m/s]."""
     feet_vel: Tensor
@@ -137,11 +129,6 @@ class Terms:
     def _obs_projected_gravity(self) -> Tensor:
         """Unit vector along gravity, in the base frame: (0, 0, -1) when the base is level [1]."""
         return self.projected_gravity
-
-    @unit("m/s, m/s, rad/s")
-    def _obs_commands(self) -> Tensor:
-        """Commanded vx (forward), vy (leftward) and yaw rate (left positive), in the base frame [m/s, m/s, rad/s]."""
-        return self.commands[:, :3]
 
     @unit("rad")
     def _obs_dof_pos(self) -> Tensor:
@@ -202,20 +189,6 @@ class Terms:
         return units * self.contacts.force
 
     # ---- rewards: (N,) each, before the multiplication by scale and control step ---------------------------------------
-
-    @concurrent
-    @unit("1")
-    def _reward_tracking_lin_vel(self) -> Tensor:
-        """Following the commanded horizontal velocity: exp(-|error|^2 / sigma)."""
-        error = velocity_error(self.commands, self.base_lin_vel)
-        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
-
-    @concurrent
-    @unit("1")
-    def _reward_tracking_ang_vel(self) -> Tensor:
-        """Following the commanded yaw rate: exp(-error^2 / sigma)."""
-        error = yaw_rate_error(self.commands, self.base_ang_vel)
-        return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
 
     @concurrent
     @unit("m^2/s^2")
@@ -302,17 +275,6 @@ class Terms:
         return (self.torques.abs() - limit).clamp(min=0.0).sum(dim=1)
 
     @concurrent
-    @unit("s")
-    def _reward_feet_air_time(self) -> Tensor:
-        """Long swings: air time minus its target, paid at touch-down while any motion is commanded [s].
-
-        legged_gym rewards swings only under a horizontal command. Steps for turning on the spot are then never rewarded, and
-        not learned.
-        """
-        swing = self.contacts.last_air_time - self.cfg.rewards.air_time_target_s
-        return (swing * self.contacts.first_contact).sum(dim=1) * self.is_moving
-
-    @concurrent
     @unit("1")
     def _reward_stumble(self) -> Tensor:
         """Stumbling: 1 if the horizontal force on a foot exceeds five times the vertical one."""
@@ -320,41 +282,11 @@ class Terms:
         return (force[:, :, :2].norm(dim=2) > 5.0 * force[:, :, 2].abs()).any(dim=1).float()
 
     @concurrent
-    @unit("rad")
-    def _reward_stand_still(self) -> Tensor:
-        """Sum of the joints' distances from their default angles, without wheels, while no motion is commanded [rad]."""
-        return self.without_wheels((self.dof_pos - self.default_dof_pos).abs()).sum(dim=1) * ~self.is_moving
-
-    @concurrent
     @unit("N")
     def _reward_feet_contact_forces(self) -> Tensor:
         """Sum of the forces by which contacts of feet exceed max_contact_force [N]."""
         force = self.contact_forces[:, self.feet_indices].norm(dim=2)
         return (force - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
-
-    @concurrent
-    @unit("s")
-    def _reward_single_stance(self) -> Tensor:
-        """Steps of a biped: half of air_time_target_s plus the air time of the swinging foot, while exactly one foot stands
-        and any motion is commanded [s].
-
-        Beyond the target, a longer air time earns less, and from twice the target on the reward is 0. If every long swing
-        were rewarded, robots would take one step a second and could not turn in between. If the fixed half were missing,
-        short steps would earn almost nothing, and robots that began to hop on both feet would go on hopping.
-        """
-        alone = (self.contacts.in_contact.sum(dim=1) == 1) & self.is_moving
-        target = self.cfg.rewards.air_time_target_s
-        swing = target - (self.contacts.air_time.amax(dim=1) - target).abs()
-        return torch.where(alone & (swing > 0.0), 0.5 * target + swing, 0.0)
-
-    @concurrent
-    @unit("s")
-    def _reward_uneven_steps(self) -> Tensor:
-        """Limping: difference between the longest and the shortest of the feet's last swings, while any motion is commanded
-        [s].
-        """
-        swings = self.contacts.last_air_time
-        return (swings.amax(dim=1) - swings.amin(dim=1)) * self.is_moving
 
     @concurrent
     @unit("m^2/s^2")
@@ -410,17 +342,3 @@ class Terms:
         assert self.terrain is not None
         x, y = self.terrain.reach
         return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
-
-    # ---- metrics: (N,) each, averaged over robots and steps; for names that end in `_rmse` the root is logged ------------
-
-    @concurrent
-    @unit("m^2/s^2")
-    def _metric_lin_vel_rmse(self) -> Tensor:
-        """Squared error of the horizontal velocity [m^2/s^2]."""
-        return velocity_error(self.commands, self.base_lin_vel)
-
-    @concurrent
-    @unit("rad^2/s^2")
-    def _metric_ang_vel_rmse(self) -> Tensor:
-        """Squared error of the yaw rate [rad^2/s^2]."""
-        return yaw_rate_error(self.commands, self.base_ang_vel)
