@@ -39,3 +39,8 @@ def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> No
             raise StateError(f"{of}.{name} is {found}, not {wanted}")
     for name, tensor in tensors.items():
         tensor.copy_(saved[name])
+
+
+def tensors_of(owner: Any) -> dict[str, Tensor]:
+    """Return the attributes of an object that are tensors, by name. None has no attributes."""
+    return {} if owner is None else {name: value for name, value in vars(owner).items() if isinstance(value, Tensor)}

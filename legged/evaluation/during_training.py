@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from legged.config import LeggedConfig, TaskConfig
 from legged.envs import BaseTask
 from legged.envs.actions import ordinary_tensors
-from legged.envs.base_task import seed_host
 from legged.envs.checks import evaluated_figures
 from legged.evaluation.velocity_grid import Grid, axes_of
 from legged.evaluation.velocity_tracking import place_to_track
 from legged.graph.step_graph import StepGraph
 from legged.learning.run_state import kept_generators
+from legged.mdp.random_pool import seed_host
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.physics import resolve_physics
 from legged.policies.actor import Actor

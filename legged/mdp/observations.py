@@ -1,7 +1,9 @@
 """Observation groups: named terms, each evaluated once per step, then scaled, given noise, clipped and concatenated."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,7 +24,7 @@ class ObservationTerms:
             TermError: a term fails, or does not return (N, width).
             ValueError: there is no term.
         """
-        self._functions = dict(functions)
+        self._functions = {name: of_one_shape(function) for name, function in functions.items()}
         self.columns: dict[str, slice] = {}
         """Term -> its columns in `values`."""
         start = 0
@@ -155,3 +157,20 @@ class ObservationGroup:
         """Fill the history of the robots in `mask` (N,) with the newest step."""
         if self.history > 1:
             masked_set_(self._steps, mask, self._now.unsqueeze(1).expand_as(self._steps))
+
+
+def of_one_shape(term: Callable[[], Tensor]) -> Callable[[], Tensor]:
+    """Return a function that calls `term` and raises ValueError if the shape differs from the one of the first call."""
+    first: Any = None
+
+    @functools.wraps(term)
+    def checked() -> Tensor:
+        nonlocal first
+        value = term()
+        shape = getattr(value, "shape", None)
+        first = shape if first is None else first
+        if shape != first:
+            raise ValueError(f"returned a tensor {tuple(shape or ())}, but {tuple(first)} in its first call")
+        return value
+
+    return checked

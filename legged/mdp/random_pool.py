@@ -1,7 +1,9 @@
 """Pool of the random numbers of a step, drawn all at once."""
 
+import random
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,3 +63,9 @@ class RandomPool:
         if self._slices:
             self._values.uniform_()  # type: ignore[union-attr]
             torch.addcmul(self._low, self._values, self._span, out=self._values)  # type: ignore[arg-type]
+
+
+def seed_host(seed: int) -> None:
+    """Seed the global random generators of Python and NumPy, which methods of users may read."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
