@@ -63,8 +63,9 @@ class DevicePPO(CriticWarmup):
     The differences from rsl-rl are these. The learning rate is a tensor on the device. Samples are shuffled into contiguous
     memory once per update, instead of being gathered for every mini-batch. The Gaussian's log-probability, entropy and
     divergence have closed forms. The optimiser is fused. Losses are summed on the device and read once per update. An actor's
-    estimator learns from the same mini-batches. If a feature needs rsl-rl's own update, `why_stock` names the feature and
-    that update runs.
+    estimator learns from the same mini-batches. On a GPU, `FusedUpdate` takes the same steps by Triton kernels, unless
+    `why_not` names a reason against it. If a feature needs rsl-rl's own update, `why_stock` names the feature and that update
+    runs.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
