@@ -253,5 +253,45 @@ def test_without_a_compiler_torch_learns(monkeypatch):
     assert torch.equal(parameters(alg), parameters(other))
 
 
-def test_what_keeps_the_kernels_from_running_is_named():
+@pytest.mark.slow
+def test_a_standard_deviation_out_of_bounds_counts_as_the_bound():
+    def change(alg):
+        alg.actor.distribution.std_range = [0.6, 1.0]  # it is 0.51
+
+    pair = both(change=change, num_mini_batches=1)
+    wanted, found = (alg.update() for alg in pair)
+    assert found == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+    assert float(pair[1].actor.distribution.std_param.min()) >= 0.6
+
+
+def wide_input(alg):
+    alg.actor.mlp[0] = torch.nn.Linear(64, 16)
+    alg.storage.actions = torch.zeros(1, 1, 1).expand(2**10, 2**17, 3)  # 2^26 rows with mirror images
+
+
+REASONS = {
+    "a parameter is not learned": lambda alg: alg.actor.distribution.std_param.requires_grad_(False),
+    "a mini-batch has too many rows for 32-bit indices": wide_input,
+    "advantages are normalised for each mini-batch": lambda alg: setattr(alg, "normalize_advantage_per_mini_batch", True),
+    "train.runner.matmul is float32": lambda alg: setattr(torch.backends.cuda.matmul, "allow_tf32", False),
+}
+
+
+@pytest.fixture
+def tf32():
+    """The switch of torch for products in TF32, as it was afterwards."""
+    switch = torch.backends.cuda.matmul
+    before = switch.allow_tf32
+    yield switch
+    switch.allow_tf32 = before
+
+
+def test_what_keeps_the_kernels_from_running_is_named(tf32):
     assert why_not(learner(DevicePPO)) == "the device is not a GPU"
+    for reason, change in REASONS.items():
+        alg = learner(DevicePPO)
+        alg.device = "cuda:0"
+        tf32.allow_tf32 = True
+        assert why_not(alg) == ""
+        change(alg)
+        assert why_not(alg) == reason

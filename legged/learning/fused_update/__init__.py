@@ -18,6 +18,7 @@ import torch
 
 from legged.learning.closed_form import fits
 from legged.learning.estimator import EstimatingModel
+from legged.learning.fused_update.layout import padded
 
 if TYPE_CHECKING:
     from legged.learning.ppo import DevicePPO
@@ -26,10 +27,12 @@ if TYPE_CHECKING:
 def why_not(alg: "DevicePPO") -> str:
     """Return the reason why the kernels can't compute a learner's updates, or an empty text."""
     rows = 2 * alg.storage.actions[..., 0].numel() // alg.num_mini_batches
-    widest = max(len(parameter) for model in (alg.actor, alg.critic) for parameter in model.mlp.parameters())
+    parameters = [parameter for model in (alg.actor, alg.critic) for parameter in model.parameters()]
+    widest = padded(max(max(parameter.shape) for parameter in parameters))
     reasons = {
         "the device is not a GPU": torch.device(alg.device).type != "cuda",
         "Triton is not installed": importlib.util.find_spec("triton") is None,
+        "a parameter is not learned": not all(parameter.requires_grad for parameter in parameters),
         "the actor has an estimator": isinstance(alg.actor, EstimatingModel),
         "the layers are not linear with ELU between them": not all(fits(model.mlp) for model in (alg.actor, alg.critic)),
         "the standard deviation is learned as its logarithm": alg.actor.distribution.std_type != "scalar",

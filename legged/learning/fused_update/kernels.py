@@ -7,7 +7,9 @@ NaN passes through every kernel: comparisons select values so that a NaN operand
 import triton
 import triton.language as tl
 
-HALF_LOG_2PI = tl.constexpr(0.9189385332046727)
+from legged.learning import closed_form
+
+HALF_LOG_2PI = tl.constexpr(closed_form.HALF_LOG_2PI)
 
 
 @triton.jit
@@ -93,9 +95,9 @@ def actor_loss(mean, order, actions, columns, signs, log_prob, advantage, old_me
     """Write the gradient of PPO's surrogate by the mean actions, times the number of rows, to `gradient` (rows, PADDED).
 
     Rows are the samples and then their mirror images. `order` (samples,) are the samples' rows in the rollout's `actions`,
-    `log_prob`, `advantage` and `old_mean`. `largest` becomes the largest |gradient|. A row of `sums` (., 4 + PADDED) gets a
-    program's sums of: surrogate, KL(old || new) over the samples, square differences to the mirror image, a column of
-    `critic_loss`, gradient by std (PADDED).
+    `log_prob`, `advantage` and `old_mean`. `old_std` is the same in all rows. `largest` becomes the largest |gradient|. A row
+    of `sums` (., 4 + PADDED) gets a program's sums of: surrogate, KL(old || new) over the samples, square differences to the
+    mirror image, a column of `critic_loss`, gradient by std (PADDED).
     """
     program = tl.program_id(0)
     row = program * BLOCK + tl.arange(0, BLOCK)

@@ -60,6 +60,7 @@ class Network:
         parts = [parts_of(layer, rows) for layer in layers for _ in range(layer.weight, layer.end, BLOCK)]
         self.parts = torch.tensor(parts, dtype=torch.int32, device=device)
         """Number of parts of each block of parameters."""
+        self.one_part = torch.ones_like(self.parts)
         self.partial = torch.zeros(max(parts), self.size, device=device)
         """Gradient of each part of the rows (parts, size)."""
         self.unit, self.one = torch.ones(1, device=device), torch.ones(1, device=device)

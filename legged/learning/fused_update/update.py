@@ -65,7 +65,9 @@ class FusedUpdate:
         self.totals = self.gradient[layout.size :]
         self.sums = zeros(self.rows // ROWS, totals)
         self.largest, self.no_factor = zeros(2, 4), torch.full((1,), 16.0, device=device)
+        """Column 0 has the largest |gradient| by the outputs of actor and critic; `no_factor` is one whose factor is 1."""
         self.scalars = zeros(2, 4)
+        """Numbers that `settle` leaves to `adam`."""
         self.squares = zeros(sum(len(network.parts) for network in self.networks))
         self._branch = Branch(device)
 
@@ -130,6 +132,7 @@ class FusedUpdate:
         st = self.alg.storage
         batches = self.alg.num_mini_batches
         order = self.alg._order(self.samples * batches)
+        self._bound_std()
         self.shadow.copy_(self.vector)
         self.largest.zero_()
         for model, network, mirror in zip(self.models, self.networks, self._mirror_inputs, strict=True):
@@ -158,6 +161,7 @@ class FusedUpdate:
             self._average()
         self._settle(critic_alone, losses)
         self._adam()
+        self._bound_std()
 
     def _actor_loss(self, network: "Network", order: Tensor) -> None:
         st, columns = self.alg.storage, self.columns
@@ -184,9 +188,7 @@ class FusedUpdate:
         start = 0
         for network in self.networks:
             own, programs = self.gradient[network.start :], len(network.parts)
-            kernels.reduce[(programs,)](
-                own, torch.ones_like(network.parts), own, self.squares[start:], self.no_factor, 1.0, 0, BLOCK
-            )
+            kernels.reduce[(programs,)](own, network.one_part, own, self.squares[start:], self.no_factor, 1.0, 0, BLOCK)
             start += programs
 
     def _settle(self, critic_alone: bool, losses: Tensor) -> None:
@@ -207,5 +209,7 @@ class FusedUpdate:
             self.vector, self.first, self.second, self.shadow, self.gradient, self.rate, self.scalars, layout.actor_end,
             *group["betas"], group["eps"], BLOCK,
         )  # fmt: skip
-        std = self.vector[layout.std : layout.std + self.actions]
-        std.clamp_(*self.alg.actor.distribution.std_range)
+
+    def _bound_std(self) -> None:
+        """Clamp the standard deviation to its bounds, as `keep_std_in_bounds` does after a step of the optimiser."""
+        self.vector[self.layout.std : self.layout.std + self.actions].clamp_(*self.alg.actor.distribution.std_range)
