@@ -3,6 +3,7 @@
 import os
 import sys
 import threading
+from collections.abc import Iterable
 
 import torch
 import torch.distributed as dist
@@ -74,6 +75,14 @@ def sum_over_ranks_(tensor: Tensor) -> Tensor:
     if dist.is_initialized():
         dist.all_reduce(tensor)
     return tensor
+
+
+def copy_from_first_(tensors: Iterable[Tensor]) -> None:
+    """Overwrite tensors, contiguous or not, with those of the first process."""
+    for tensor in tensors:
+        whole = tensor.contiguous()  # a process group takes no other
+        dist.broadcast(whole, src=0)
+        tensor.copy_(whole)
 
 
 def any_rank(asked: bool, device: torch.device) -> bool:

@@ -15,7 +15,7 @@ from torch import Tensor
 from legged.learning import closed_form
 from legged.learning.closed_form import HALF_LOG_2PI
 from legged.learning.critic_warmup import CriticWarmup
-from legged.learning.distributed import SharedGradients
+from legged.learning.distributed import SharedGradients, copy_from_first_
 from legged.learning.estimator import SECTION, EstimatingModel, EstimationErrors
 from legged.learning.fused_update import why_not
 from legged.learning.networks import action_std, output_of, update_normalizer
@@ -120,6 +120,12 @@ class DevicePPO(CriticWarmup):
         except FAILURES as error:
             return f"Triton fails here: {' '.join(str(error).split())[:200]}"
         return ""
+
+    def broadcast_parameters(self) -> None:
+        """Give all processes the networks of the first. The kernels pad their weights, so these are not contiguous."""
+        networks = [self.actor, self.critic, *([self.rnd.predictor, self.rnd.target] if self.rnd else [])]
+        for network in networks:
+            copy_from_first_(network.state_dict().values())
 
     def learn_to_estimate(self, errors: EstimationErrors, learning_rate: float) -> None:
         """Set the object that measures estimation errors, and the learning rate of the actor's estimator. Call this once,

@@ -220,6 +220,20 @@ def test_processes_with_equal_gradients_learn_like_one(monkeypatch):
     assert found == pytest.approx(wanted, rel=1e-4, abs=1e-6)
 
 
+def test_networks_are_broadcast_to_all_processes(monkeypatch):
+    """NCCL refuses tensors that are not contiguous, such as the padded weights of the kernels."""
+    alg = both()[1]
+    before = parameters(alg)
+
+    def broadcast(tensor, src):
+        assert tensor.is_contiguous()
+        tensor.mul_(2.0)
+
+    monkeypatch.setattr(torch.distributed, "broadcast", broadcast)
+    alg.broadcast_parameters()
+    torch.testing.assert_close(parameters(alg), 2.0 * before, rtol=0.0, atol=0.0)
+
+
 @pytest.mark.slow
 def test_checkpoints_are_exchanged():
     """Kernels go on where autograd stopped, and the other way round."""
