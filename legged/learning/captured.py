@@ -95,17 +95,17 @@ class CapturedRunner(Runner):
             if unlogged is not None:
                 self._log_before(unlogged, launched)
             unlogged = launched
-            saves = self.logger.writer is not None and iteration % self.cfg["save_interval"] == 0
+            due = iteration % self.cfg["save_interval"] == 0
             evaluates = self.evaluations is not None and self.evaluations.may_be_due(iteration + 1, total)
             # The second-last iteration is logged at once, so that a request to stop takes effect before the last one starts.
-            if not self._runs_ahead or saves or evaluates or iteration == first or iteration + 2 >= total:
+            if not self._runs_ahead or due or evaluates or iteration == first or iteration + 2 >= total:
                 self._log(launched)
                 unlogged = None
             if iteration == first:
                 stage_ended("first iteration")
-            if saves:
+            if due and self.logger.writer is not None:
                 self.save(str(Path(self.logger.log_dir) / f"model_{iteration}.pt"))
-            if saves or evaluates:
+            if due or evaluates:
                 clock = None  # the next clock starts anew, to leave out the time of saving and evaluation
         if self.logger.writer is not None:
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
@@ -119,10 +119,11 @@ class CapturedRunner(Runner):
 
     @property
     def _runs_ahead(self) -> bool:
-        """True if the next iteration is launched before the previous one is logged. With several processes it is False,
-        because all of them must agree before training stops.
+        """True if the next iteration is launched before the previous one is logged. All processes must do so at the same
+        iterations, because they agree on stopping when they log. Only the first one knows when an evaluation is due.
         """
-        return torch.device(self.device).type == "cuda" and not self.is_distributed
+        alike = not self.is_distributed or not self.env.cfg.train.runner.evaluate_interval
+        return torch.device(self.device).type == "cuda" and alike
 
     def _steps(self) -> Steps:
         """Return the object that collects the rollouts."""

@@ -53,7 +53,9 @@ def join(ranks: Ranks, device: torch.device) -> None:
     try:
         if device.type == "cuda":
             torch.cuda.set_device(device)
-            dist.init_process_group("nccl", rank=ranks.rank, world_size=ranks.count, device_id=device)
+            dist.init_process_group(  # gloo carries what the processes agree on, and does not wait for the GPU
+                "cpu:gloo,cuda:nccl", rank=ranks.rank, world_size=ranks.count, device_id=device
+            )
         else:
             dist.init_process_group("gloo", rank=ranks.rank, world_size=ranks.count)
     except dist.DistError as error:
@@ -85,13 +87,11 @@ def copy_from_first_(tensors: Iterable[Tensor]) -> None:
         tensor.copy_(whole)
 
 
-def any_rank(asked: bool, device: torch.device) -> bool:
-    """Return True if `asked` is true in any process. All processes must call this function, because each waits for the
-    others.
+def any_rank(*asked: bool) -> list[bool]:
+    """Return for each of `asked` whether it is true in any process. All processes must call this function, because each waits
+    for the others.
     """
-    if not dist.is_initialized():
-        return asked
-    return bool(sum_over_ranks_(torch.tensor(float(asked), device=device)).item())
+    return (sum_over_ranks_(torch.tensor(asked, dtype=torch.float32)) > 0.0).tolist()
 
 
 class SharedGradients:

@@ -143,11 +143,13 @@ class QuietLogger(Logger):
                     behavior=losses.get("behavior"),
                 )
             )
-        if any_rank(bool(self.divergence.why_stop), torch.device(self.device)):
+        why_end = self.why_end() if self.why_end is not None else ""
+        diverged, ended, stopped = any_rank(bool(self.divergence.why_stop), bool(why_end), self.stop_requested)
+        if diverged:
             raise Diverged(self.divergence.why_stop or "numbers of another process were NaN or infinite")
-        if self.why_end is not None and any_rank(bool(self.why_end()), torch.device(self.device)) and it + 1 < total_it:
+        if ended and it + 1 < total_it:
             raise Ended
-        if any_rank(self.stop_requested, torch.device(self.device)) and it + 1 < total_it:
+        if stopped and it + 1 < total_it:
             raise Interrupted
 
     def _log_return_std(self, it: int) -> None:

@@ -30,12 +30,15 @@ REPOSITORY = Path(legged.__file__).parents[1]
 TESTS = Path(__file__).parents[1]
 TRAIN = ["--task", TASK, "--sim_device", "cpu", "--num_envs", "8", *TINY_TRAINING]
 
-# train.py, whose processes also leave what they have learned, and their robots' friction, in rank<r>.pt
+# train.py, whose processes log an iteration while the next one runs, as on GPUs. They also leave what they have learned, and
+# their robots' friction, in rank<r>.pt.
 SPY = """
 import sys, torch
 from legged.process.ranks import Ranks
 from legged.cli.train import train
+from legged.learning.captured import CapturedRunner
 from legged.learning.runner import Runner
+CapturedRunner._runs_ahead = True
 learn = Runner.train
 
 def spy(runner, until):
