@@ -72,6 +72,32 @@ def quat_from_angle_axis(angle: Tensor, axis: Tensor) -> Tensor:
     return torch.cat([torch.cos(half), torch.sin(half) * normalize(axis, dim=-1)], dim=-1)
 
 
+def quat_from_rotation_vector(vector: Tensor) -> Tensor:
+    """Return the quaternions (..., 4), w first, of turns by the length [rad] of `vector` (..., 3) about its direction."""
+    half = 0.5 * vector.norm(dim=-1, keepdim=True)
+    return torch.cat([torch.cos(half), 0.5 * torch.sinc(half / torch.pi) * vector], dim=-1)
+
+
+def rotation_vector(quat: Tensor) -> Tensor:
+    """Return the axis of `quat` (..., 4), w first, times its angle in [0, pi] [rad], (..., 3)."""
+    quat = _w_first(quat) * torch.where(quat[..., :1] < 0.0, -1.0, 1.0)
+    sine = quat[..., 1:].norm(dim=-1, keepdim=True)
+    angle = 2.0 * torch.atan2(sine, quat[..., :1])
+    return quat[..., 1:] * torch.where(sine > 1e-12, angle / sine.clamp(min=1e-12), 2.0)
+
+
+def quat_conjugate(quat: Tensor) -> Tensor:
+    """Return the inverse rotations (..., 4) of unit quaternions `quat` (..., 4), w first."""
+    return torch.cat([_w_first(quat)[..., :1], -quat[..., 1:]], dim=-1)
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Return the products (..., 4) of quaternions, w first: the turn `b`, followed by the turn `a`."""
+    aw, av, bw, bv = _w_first(a)[..., :1], a[..., 1:], _w_first(b)[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=-1)
+
+
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """Return the same angle in [-pi, pi) [rad]."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

@@ -64,7 +64,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"process"},
     {"graph", "config", "figures", "tables"},
     {"robots", "terrain"},
-    {"physics"},
+    {"motion", "physics"},
     {"mdp"},
     {"envs"},
     {"user_modules", "gymnasium_ids"},

@@ -8,9 +8,13 @@ import torch
 from legged.math import (
     evenly_spaced,
     masked_set_,
+    quat_conjugate,
+    quat_from_rotation_vector,
+    quat_multiply,
     quat_rotate,
     quat_rotate_inverse,
     quat_to_matrix,
+    rotation_vector,
     uniform,
     wrap_to_pi,
     yaw_of,
@@ -38,6 +42,29 @@ def test_rotation_is_mujocos():
     for result, quat, vec in zip(expected, quats.double().numpy(), vectors.double().numpy(), strict=True):
         mujoco.mju_rotVecQuat(result, vec, quat)
     np.testing.assert_allclose(quat_rotate(quats, vectors), expected, atol=1e-5)
+
+
+def test_products_are_mujocos():
+    a, _ = random_quats_and_vectors()
+    b = a.roll(1, dims=0)
+    expected = np.zeros((len(a), 4))
+    for result, one, other in zip(expected, a.double().numpy(), b.double().numpy(), strict=True):
+        mujoco.mju_mulQuat(result, one, other)
+    np.testing.assert_allclose(quat_multiply(a, b), expected, atol=1e-6)
+    np.testing.assert_allclose(quat_multiply(a, quat_conjugate(a)), [[1.0, 0.0, 0.0, 0.0]] * len(a), atol=1e-6)
+
+
+def test_rotation_vectors_are_mujocos():
+    """Both ways, from no turn to half a turn; q and -q are one rotation."""
+    quats, _ = random_quats_and_vectors()
+    quats[0], quats[1] = torch.tensor([1.0, 0.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0, 0.0])
+    expected = np.zeros((len(quats), 3))
+    for result, quat in zip(expected, quats.double().numpy(), strict=True):
+        mujoco.mju_quat2Vel(result, quat if quat[0] >= 0 else -quat, 1.0)
+    found = rotation_vector(quats)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    back = quat_from_rotation_vector(found)
+    np.testing.assert_allclose((back * quats).sum(dim=1).abs(), 1.0, atol=1e-6)
 
 
 def test_inverse_rotation_is_mujocos_with_the_conjugate():

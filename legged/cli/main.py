@@ -15,7 +15,7 @@ from legged.errors import ConfigError, suggest
 SECTIONS = {
     "every day": ("train", "play", "watch", "list"),
     "measure": ("evaluate", "runs", "episodes", "benchmark", "sweep"),
-    "your own": ("robot", "terrain", "fit-actuator", "migrate"),
+    "your own": ("robot", "terrain", "motion", "fit-actuator", "migrate"),
     "on a robot": ("export", "deploy"),
     "this machine": ("warmup", "completion"),
 }
@@ -52,6 +52,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "robot add": ("legged.cli.robot:add", "turn a URDF or MJCF file into a robot and a task"),
     "robot show": ("legged.cli.robot:show", "joints, limits, gains and feet of a robot"),
     "terrain": ("legged.cli.terrain:terrain", "pictures of a task's terrain"),
+    "motion": ("legged.cli.motion:motion", "check and resample reference motions, and film them"),
     "export": ("legged.cli.export:export", "export every checkpoint of a run to ONNX"),
     "deploy sim": ("legged.cli.deploy:sim", "run the robot's program against a simulated robot"),
     "deploy robot": ("legged.cli.deploy:robot", "serve a simulated robot over UDP"),

@@ -1,0 +1,148 @@
+"""Files of motions: csv (root position, root quaternion with w last, joint angles), npz of mjlab and of holosoma, and ONNX
+trackers that hold their motion.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged.errors import ConfigError, suggest
+from legged.motion.clip import Clip, make_clip
+from legged.motion.kinematics import Skeleton
+from legged.process.paths import relative
+
+ROOT = 7
+"""Columns of the root: position and quaternion."""
+CSV_FPS = 30.0
+"""Frames per second of a csv file, which does not say."""
+
+
+def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
+    """Read a motion of a robot. Bodies are left out: `Skeleton` computes them from root and joints, because their frames
+    differ between models of one robot.
+
+    Raises:
+        ConfigError: the file can't be read, or does not fit the robot.
+    """
+    where, readers = relative(path), {".csv": _read_csv, ".npz": _read_npz, ".onnx": _read_onnx}
+    if path.suffix not in readers:
+        raise ConfigError(f"{where}: motions are read from {', '.join(readers)}")
+    try:
+        if path.suffix == ".csv":
+            return _read_csv(path, skeleton, where, csv_fps)
+        return readers[path.suffix](path, skeleton, where)
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise ConfigError(f"{where}: can't be read as a motion ({error})") from error
+
+
+def _read_csv(path: Path, skeleton: Skeleton, where: str, fps: float = CSV_FPS) -> Clip:
+    rows = np.loadtxt(path, delimiter=",", ndmin=2)
+    _check_width(rows, ROOT + len(skeleton.robot.joint_names), where)
+    return make_clip(path.stem, fps, rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, ROOT:], where)
+
+
+def _read_npz(path: Path, skeleton: Skeleton, where: str) -> Clip:
+    with np.load(path) as file:
+        arrays = dict(file)
+    if "joint_pos" not in arrays:
+        raise ConfigError(f"{where}: has no array 'joint_pos'{suggest('joint_pos', arrays, 'arrays')}")
+    rows, names = arrays["joint_pos"], _texts(arrays.get("joint_names"))
+    count = len(skeleton.robot.joint_names) if names is None else len(names)
+    fps = float(np.ravel(arrays["fps"])[0])
+    if rows.ndim == 2 and rows.shape[1] == ROOT + count and names is not None:
+        pos, quat, joint = rows[:, :3], rows[:, 3:ROOT], rows[:, ROOT:]
+    else:
+        _check_width(rows, count, where)
+        pos, quat = _base_of(arrays, _texts(arrays.get("body_names")), skeleton, where)
+        joint = rows
+    return make_clip(path.stem, fps, pos, quat, _ordered(joint, names, skeleton, where), where)
+
+
+def _read_onnx(path: Path, skeleton: Skeleton, where: str) -> Clip:
+    import onnx  # only needed here, and slow to import
+
+    try:
+        graph = onnx.load(str(path))
+    except Exception as error:  # protobuf's errors have no common class
+        raise ConfigError(f"{where}: onnx can't read it: {' '.join(str(error).split())[:200]}") from error
+    arrays = _tables(graph.graph)
+    if "joint_pos" not in arrays:
+        raise ConfigError(f"{where}: the model has no output 'joint_pos' that is looked up by time step; it holds no motion")
+    said = {entry.key: entry.value for entry in graph.metadata_props}
+    names = _list(said.get("joint_names") or said.get("dof_names"))
+    joint = _ordered(arrays["joint_pos"], names, skeleton, where)
+    if "ref_pos_xyz" in arrays:  # holosoma: the pose of the torso
+        quat = arrays["ref_quat_xyzw"][:, [3, 0, 1, 2]].astype(np.float64)
+        pos, quat = skeleton.root_poses("torso_link", arrays["ref_pos_xyz"].astype(np.float64), quat, joint)
+    else:
+        pos, quat = _base_of(arrays, _list(said.get("body_names")), skeleton, where)
+    return make_clip(path.stem, 50.0, pos, quat, joint, where)
+
+
+def _tables(graph: Any) -> dict[str, np.ndarray]:
+    """Return for each output of an ONNX graph the table (T, ...) that it is gathered from, if it is."""
+    from onnx import numpy_helper
+
+    values = {tensor.name: tensor for tensor in graph.initializer}
+    makers = {output: node for node in graph.node for output in node.output}
+    values |= {
+        node.output[0]: attribute.t
+        for node in graph.node
+        if node.op_type == "Constant"
+        for attribute in node.attribute
+        if attribute.name == "value"
+    }
+    found = {}
+    for output in graph.output:
+        node = makers.get(output.name)
+        while node is not None and node.op_type in ("Identity", "Cast", "Unsqueeze", "Squeeze", "Reshape"):
+            node = makers.get(node.input[0])
+        if node is not None and node.op_type == "Gather" and node.input[0] in values:
+            found[output.name] = numpy_helper.to_array(values[node.input[0]])
+    return found
+
+
+def _base_of(
+    arrays: Mapping[str, np.ndarray], bodies: Sequence[str] | None, skeleton: Skeleton, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the base's positions (T, 3) and quaternions (T, 4), from `body_pos_w` (T, B, 3) and `body_quat_w` (T, B, 4). If
+    the `bodies` have no names, the first is the base.
+    """
+    base = skeleton.robot.file.base
+    for name in ("body_pos_w", "body_quat_w"):
+        if name not in arrays:
+            raise ConfigError(f"{where}: holds no root pose: there is no '{name}'{suggest(name, arrays, 'arrays')}")
+    if bodies is not None and base not in bodies:
+        raise ConfigError(
+            f"{where}: has no body '{base}', the base of {skeleton.robot.name}{suggest(base, bodies, 'bodies')}"
+        )
+    index = 0 if bodies is None else list(bodies).index(base)
+    return arrays["body_pos_w"][:, index], arrays["body_quat_w"][:, index]
+
+
+def _ordered(joint: np.ndarray, names: Sequence[str] | None, skeleton: Skeleton, where: str) -> np.ndarray:
+    """Return joint angles (T, D) in the order of the robot's model. Without `names`, the file has this order."""
+    own = skeleton.robot.joint_names
+    if names is None:
+        _check_width(joint, len(own), where)
+        return joint
+    for name in own:
+        if name not in names:
+            raise ConfigError(f"{where}: has no joint '{name}' of {skeleton.robot.name}{suggest(name, names, 'joints')}")
+    return joint[:, [list(names).index(name) for name in own]]
+
+
+def _check_width(rows: np.ndarray, width: int, where: str) -> None:
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ConfigError(f"{where}: expected rows of {width} numbers, got the shape {rows.shape}")
+
+
+def _texts(names: np.ndarray | None) -> list[str] | None:
+    return None if names is None else [str(name) for name in names.tolist()]
+
+
+def _list(text: str | None) -> list[str] | None:
+    """Return the names in a metadata text: JSON, or names separated by commas."""
+    return None if not text else [name.strip(' "[]') for name in text.split(",")]
