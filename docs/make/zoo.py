@@ -21,7 +21,7 @@ from shipping import ship
 from legged.cli.evaluate import ROBOTS, check_points
 from legged.commandline.arguments import pick_device
 from legged.commandline.command import EXIT_FAILED, run_main, stopping_on_signals
-from legged.config import LeggedConfig, parse_override, to_dict
+from legged.config import LeggedConfig, follows_velocities, parse_override, to_dict
 from legged.config.dotted import differences
 from legged.errors import ConfigError
 from legged.evaluation.engines import engine_of
@@ -137,7 +137,7 @@ def plan(args: argparse.Namespace) -> list[Training]:
         for name in names:
             changes = [*map(parse_override, overrides(args)), ("env.seed", seed)]
             cfg = task_config(name, changes, on_cpu=device.type == "cpu")
-            if not isinstance(cfg, LeggedConfig):
+            if not follows_velocities(cfg):
                 raise ConfigError(f"'{name}' follows no commands; the table has only tasks that do")
             own = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
             flat = cfg.terrain.mesh_type == "plane"

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from legged.commandline.arguments import TASK, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY, sub_command
-from legged.config import LeggedConfig, TaskConfig, override
+from legged.config import TaskConfig, has_robot, override
 from legged.config.networks import learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
@@ -252,7 +252,7 @@ def ground(args: argparse.Namespace) -> int:
     where = cfg.origins.where("sim.physics")
     if resolve_physics(cfg.sim.physics, device, where, cfg.env.num_envs) != "mujoco_warp":
         raise ConfigError(f"{where}: this command compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
-    if not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane":
+    if not has_robot(cfg) or cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"TASK: '{cfg.task}' has no terrain")
     settle_on(device)
     results = {}

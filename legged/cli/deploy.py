@@ -13,7 +13,7 @@ import torch
 
 from legged.commandline.arguments import POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
-from legged.config import LeggedConfig, parse_override
+from legged.config import follows_velocities, has_robot, parse_override
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
 from legged.deploy.contract import SCANS, Contract, read_contract
@@ -221,10 +221,10 @@ def _exported(name: str) -> Path:
         if not saved or saved[max(saved)].stat().st_mtime <= inside.stat().st_mtime:
             return given / EXPORTED
     policy = policy_of(name)
-    if not isinstance(policy.cfg, LeggedConfig):
+    if not follows_velocities(policy.cfg):
         raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; give a policy that follows velocity commands")
     folder = policy.output("deploy") / EXPORTED
-    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
+    changes = [*undisturbed(policy.cfg, 1), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
     export(task, act.network, folder, trained=policy.cfg)
     print(f"exported {relative(folder / 'policy.onnx')}")
@@ -240,7 +240,7 @@ def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels above `exported`
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
-            if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
+            if has_robot(cfg) and Path(cfg.robot).name == contract.robot:
                 return load_robot(cfg.robot, "--robot")
     try:
         return load_robot(contract.robot)

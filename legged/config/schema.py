@@ -1,7 +1,7 @@
 """Configuration schema: every setting of a task file, with meaning, unit, default and bounds.
 
 A file under `cfg/` states only the differences from the defaults. The sections of every task are in world.py, mdp.py and
-learning.py. Those of a legged robot with velocity commands are in legged.py.
+learning.py. Those of a task with a robot are in robot.py, and those of velocity commands in legged.py.
 """
 
 from legged.config.actuator import ActuatorConfig
@@ -19,14 +19,9 @@ from legged.config.legged import (
     CommandRanges,
     CommandsConfig,
     EvaluationConfig,
-    InitStateConfig,
     LeggedConfig,
-    LeggedControlConfig,
-    LeggedDomainRandConfig,
     LeggedObservationsConfig,
     LeggedRewardsConfig,
-    LeggedTerminationsConfig,
-    TerrainConfig,
 )
 from legged.config.mdp import (
     ControlConfig,
@@ -38,6 +33,16 @@ from legged.config.mdp import (
     TerminationsConfig,
 )
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.robot import (
+    InitStateConfig,
+    RobotConfig,
+    RobotControlConfig,
+    RobotDomainRandConfig,
+    RobotObservationsConfig,
+    RobotRewardsConfig,
+    RobotTerminationsConfig,
+    TerrainConfig,
+)
 from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
@@ -61,17 +66,20 @@ __all__ = [
     "InitStateConfig",
     "KickConfig",
     "LeggedConfig",
-    "LeggedControlConfig",
-    "LeggedDomainRandConfig",
     "LeggedObservationsConfig",
     "LeggedRewardsConfig",
-    "LeggedTerminationsConfig",
     "NewtonSolver",
     "ObservationGroupConfig",
     "ObservationsConfig",
     "PolicyConfig",
     "Range",
     "RewardsConfig",
+    "RobotConfig",
+    "RobotControlConfig",
+    "RobotDomainRandConfig",
+    "RobotObservationsConfig",
+    "RobotRewardsConfig",
+    "RobotTerminationsConfig",
     "RunnerConfig",
     "SimConfig",
     "TaskConfig",

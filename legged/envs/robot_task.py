@@ -1,14 +1,15 @@
-"""Task of a robot on its ground: control, contacts, height scan, randomisation, pushes and initial states. A subclass adds
-commands. Terms of every robot task are in robot_terms.py.
+"""Task of a robot on its ground: control, contacts, height scan, tiles, randomisation, pushes and initial states. A subclass
+adds commands. Terms of every robot task are in robot_terms.py.
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.capabilities import has_robot
+from legged.config.schema import RobotConfig, TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
@@ -22,6 +23,7 @@ from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
+from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
@@ -35,11 +37,11 @@ class RobotTask(RobotTerms, BaseTask):
     collision shapes.
     """
 
-    Config: ClassVar[type[TaskConfig]] = LeggedConfig
-    cfg: LeggedConfig
+    Config: ClassVar[type[TaskConfig]] = RobotConfig
+    cfg: RobotConfig
 
     def __init__(
-        self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
+        self, cfg: RobotConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
         """Build physics and MDP on `device`. With `graph`, the step is captured in a CUDA graph if `device` is a GPU. If
         `terrain` is given, it replaces the configured one.
@@ -59,7 +61,7 @@ class RobotTask(RobotTerms, BaseTask):
             ConfigError: the configuration is invalid for this task.
         """
         check_overrides(cls)  # comes first, because a wrong override can make other checks fail
-        assert isinstance(cfg, LeggedConfig)
+        assert has_robot(cfg)
         robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
         check_legged(cls, cfg, robot)
@@ -90,7 +92,7 @@ class RobotTask(RobotTerms, BaseTask):
         super()._allocate()
 
     def _init_buffers(self) -> None:
-        """Allocate tensors and parts for the robot, its commands and its ground."""
+        """Allocate tensors and parts for the robot, its ground and what the robot is asked to do."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
         kernels = self.physics.kernels
@@ -128,8 +130,13 @@ class RobotTask(RobotTerms, BaseTask):
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
         self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
+        self.terrain_curriculum: TerrainCurriculum | None = None
+        """Tiles on which episodes begin; None on a plane. Robots keep their tiles unless a subclass moves them."""
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) middle of the area in which each robot's episodes begin, world frame [m]."""
+        if self.terrain is not None:
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, self.dt, device, kernels)
+            self.env_origins = self.terrain_curriculum.origins
         reach, height = cfg.terrain.spawn_range if self.terrain is not None else 0.0, robot.file.spawn_height
         self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
         low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
@@ -211,6 +218,8 @@ class RobotTask(RobotTerms, BaseTask):
         """Draw joint angles near the default pose, and velocity and yaw of the base. A robot with passive joints gets one of
         the poses that were computed at the start. In these poses its kinematic loops are closed.
         """
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.draw()
         if self._poses is None:
             self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
         else:
@@ -242,7 +251,13 @@ class RobotTask(RobotTerms, BaseTask):
 
     def reset(self) -> TensorDict:
         self.disturbances.end(self.physics)
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.begin()
         return super().reset()
+
+    def reset_curricula(self) -> None:
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.reset()
 
     def redraw(self, mask: Tensor) -> None:
         super().redraw(mask)
@@ -288,11 +303,15 @@ class RobotTask(RobotTerms, BaseTask):
         progress = super().progress()
         if self.disturbances.STATE:
             progress["disturbances"] = self.disturbances.progress()
+        if self.terrain_curriculum is not None:
+            progress["terrain_curriculum"] = self.terrain_curriculum.progress()
         return progress
 
     def load_progress(self, progress: dict[str, Any]) -> None:
         super().load_progress(progress)
         self.disturbances.load_progress(progress.get("disturbances", {}))
+        if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
+            self.terrain_curriculum.load_progress(progress["terrain_curriculum"])
 
     def parts(self) -> dict[str, Any]:
         parts = {
@@ -306,4 +325,11 @@ class RobotTask(RobotTerms, BaseTask):
             parts["disturbances"] = self.disturbances
         if self.control.actuator is not None:
             parts["actuator"] = self.control.actuator
+        if self.terrain_curriculum is not None:
+            parts["terrain_curriculum"] = self.terrain_curriculum
         return parts
+
+
+def is_robot_task(task: BaseTask) -> TypeGuard[RobotTask]:
+    """Return whether a task has a robot with joints, contacts and a ground."""
+    return isinstance(task, RobotTask)

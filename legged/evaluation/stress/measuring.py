@@ -173,7 +173,7 @@ class Bench:
         commands = torch.where(parts < 0.0, parts * ends[0], parts * ends[1])
         turns = torch.arange(self.robots) % len(COMMANDS)
         own = [
-            *undisturbed(len(per_robot), HOLD_S),
+            *undisturbed(self.cfg, len(per_robot), HOLD_S),
             ("observations.add_noise", self.cfg.observations.add_noise),
             ("terrain.mesh_type", "plane"),
         ]
