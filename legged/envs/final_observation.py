@@ -1,14 +1,12 @@
 """Final observations of episodes. Watchers copy tensors at the end of each step, before episodes are reset."""
 
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 
+from legged.envs.base_task import BaseTask
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.physics import Physics
-
-if TYPE_CHECKING:
-    from legged.envs.base_task import BaseTask
 
 
 class StepWatcher(Protocol):
@@ -47,18 +45,18 @@ class FinalStep:
         self.qvel.copy_(self._physics.qvel)
 
 
-def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
+def keep_final_step(task: BaseTask, graph: bool = True) -> FinalStep:
     """Attach a `FinalStep` to a task and return it. `watch_steps` describes the arguments and errors."""
     return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
 
 
-def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
+def watch_steps(task: BaseTask, watcher: Watcher, graph: bool = True) -> Watcher:
     """Attach `watcher` to a task and return `watcher`. From now on every step calls `watcher.take`. All episodes and
     curricula are reset. With `graph`, the step with the watcher is captured on a GPU, or checked on the CPU.
 
     Raises:
         TermError: the step cannot be captured.
     """
-    task.step_watcher = watcher
+    task.step_watcher = watcher.take
     task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
     return watcher
