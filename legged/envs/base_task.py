@@ -261,8 +261,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
             return None
         errors = (cfg.bias, cfg.delay, cfg.dropped)
         terms = self.observation_terms
-        layout = (terms.values, terms.columns)
-        return ObservationErrors(*layout, sorted(measured), *errors, noise, self.numbers, height_map)
+        return ObservationErrors(terms.values, terms.columns, sorted(measured), *errors, noise, self.numbers, height_map)
 
     def _noise(self) -> dict[str, float]:
         """Return the half width of each term's noise, in the term's unit."""

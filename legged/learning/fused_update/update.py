@@ -76,7 +76,8 @@ class FusedUpdate:
         """Take a step with parameters that are 0, so that all kernels are compiled. Undo it afterwards."""
         before = self.rate.clone()
         losses = torch.zeros(6, device=self.rate.device)
-        self.learn(0, False, losses)
+        order = torch.rand(self.samples * self.alg.num_mini_batches, device=self.rate.device).argsort()
+        self.learn(order, 0, False, losses)
         self._step(0, torch.zeros(self.samples, dtype=torch.int64, device=self.rate.device), False, losses)
         self.rate.copy_(before)
         for tensor in (self.vector, self.first, self.second, self.steps):
