@@ -62,6 +62,7 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only():
 
 
 FLOORS = [  # from the ground up; each part imports from the floors below it only
+    {"deploy"},  # a robot's computer runs a copy of this folder alone
     {"errors", "math", "state"},
     {"process"},
     {"graph", "config", "figures", "tables"},
@@ -72,7 +73,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"user_modules", "gymnasium_ids"},
     {"registry"},
     {"commandline"},
-    {"learning", "rendering", "deploy"},
+    {"learning", "rendering"},
     {"policies", "gymnasium_envs"},
     {"play"},
     {"evaluation"},
@@ -81,12 +82,10 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"cli"},
 ]
 PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})
-OF_ROBOTS = ("deploy", "errors", "process")
-"""What a robot's computer runs; `process` imports no torch either."""
 WITHOUT = {  # what else a part does without
     "errors": ["torch"],
     "process": ["torch"],
-    "deploy": ["torch", "mujoco", "yaml", *(f"legged.{part}" for part in PARTS if part not in OF_ROBOTS)],
+    "deploy": ["torch", "mujoco", "yaml", *(f"legged.{part}" for part in PARTS if part != "deploy")],
     "config": ["torch"],
     "robots": ["torch"],
     "terrain": ["torch", "mujoco"],

@@ -19,7 +19,7 @@ from legged.cli.main import COMMANDS, load, split
 from legged.cli.play import play
 from legged.cli.train import train
 from legged.deploy import __main__ as program
-from legged.process.command_parser import CommandParser
+from legged.deploy.command_parser import CommandParser
 from legged.registry import import_tasks, make_task, task_config
 
 ROOT = Path(__file__).resolve().parents[1]

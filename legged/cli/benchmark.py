@@ -24,6 +24,7 @@ from legged.commandline.arguments import TASK, overrides, pick_device, register_
 from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY, sub_command
 from legged.config import TaskConfig, has_robot, override
 from legged.config.networks import learns_from_teacher
+from legged.deploy.command_parser import argument, check_number
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.evaluation.result_file import write_result
@@ -37,7 +38,6 @@ from legged.learning.teacher import Teacher, find_teacher, with_teacher
 from legged.physics import resolve_physics
 from legged.policies.actor import Actor
 from legged.policies.restore import policy_of
-from legged.process.command_parser import argument, check_number
 from legged.process.paths import ready_to_write, relative
 from legged.process.startup import STAGES_FILE
 from legged.registry import make_task, task_config

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.commandline.arguments import POLICY_HELP, import_given
+from legged.commandline.arguments import IMPORT, POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
 from legged.config import follows_velocities, has_robot, parse_override
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
+from legged.deploy.command_parser import argument, check_between
 from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError, RunError
@@ -24,7 +25,6 @@ from legged.mdp.actuator import with_rotors
 from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import IMPORT, argument, check_between
 from legged.process.paths import exists, make_folder, ready_to_write, relative, replacing, write_text
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.rendering.camera import Camera, Follower, caption, size_of

@@ -13,6 +13,7 @@ from legged.cli.main import hint_at_sub_command
 from legged.commandline.arguments import POLICY, measuring_device, policy_overrides, register_given, velocity_command
 from legged.commandline.command import sub_command
 from legged.config import follows_velocities
+from legged.deploy.command_parser import Argument, argument, check_between, check_number
 from legged.errors import ConfigError, suggest
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes, evaluate_in_gymnasium
 from legged.evaluation.following import (
@@ -33,7 +34,6 @@ from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axes_
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
 from legged.policies.restore import policy_of
-from legged.process.command_parser import Argument, argument, check_between, check_number
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
 from legged.tables import screen_table

@@ -7,12 +7,12 @@ import torch
 
 from legged.commandline.arguments import POLICY, policy_overrides, register_given, settle_on
 from legged.commandline.command import sub_command
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
 from legged.policies import export as exporting
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import argument
 from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0

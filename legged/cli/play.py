@@ -21,6 +21,7 @@ from legged.commandline.arguments import (
 from legged.commandline.command import sub_command
 from legged.config import override
 from legged.config.capabilities import follows_velocities
+from legged.deploy.command_parser import argument
 from legged.envs import is_velocity_task
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import find_run, run_config
@@ -32,7 +33,6 @@ from legged.policies.actor import Actor
 from legged.policies.episodes import for_episodes
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import TrainedPolicy, policy_of, restore, undisturbed
-from legged.process.command_parser import argument
 from legged.process.headless import HEADLESS
 from legged.process.paths import ready_to_write, relative
 from legged.registry import task_config

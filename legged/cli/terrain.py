@@ -10,8 +10,8 @@ from PIL import Image
 from legged.commandline.arguments import TASK, overrides, register_given
 from legged.commandline.command import sub_command
 from legged.config import has_robot
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
-from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
 from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles

@@ -27,6 +27,7 @@ from legged.commandline.command import EXIT_FAILED, quiet_writers, stopping_on_s
 from legged.commandline.show import summary
 from legged.config import TaskConfig, to_yaml
 from legged.config.networks import learns_from_teacher
+from legged.deploy.command_parser import argument
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.evaluation.during_training import TrainingEvaluation, check_commands
@@ -46,7 +47,6 @@ from legged.learning.timing import Timing, write_timing
 from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
-from legged.process.command_parser import argument
 from legged.process.cores import available_cores
 from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text

@@ -4,7 +4,6 @@ Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same de
 """
 
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 from legged.config.bounds import LARGEST, LONGEST_S, UNIT, between, positive, quantity, rescaled, rescaled_by_term
 from legged.config.mdp import ObservationGroupConfig, Range
@@ -132,7 +131,7 @@ class EvaluationConfig:
 class LeggedConfig(RobotConfig):
     """Configuration of a legged robot that follows velocity commands."""
 
-    DISTURBANCES: ClassVar[tuple[str, ...]] = (*RobotConfig.DISTURBANCES, "commands.curriculum.enabled")
+    DISTURBANCES = (*RobotConfig.DISTURBANCES, "commands.curriculum.enabled")
 
     commands: CommandsConfig = field(default_factory=CommandsConfig)
     """Velocity commands."""

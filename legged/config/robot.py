@@ -4,7 +4,7 @@ Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same de
 """
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import (
@@ -243,7 +243,7 @@ class RobotObservationsConfig(ObservationsConfig):
 class RobotConfig(TaskConfig):
     """Configuration of a task with a robot on its ground."""
 
-    DISTURBANCES: ClassVar[tuple[str, ...]] = (
+    DISTURBANCES = (
         *TaskConfig.DISTURBANCES,
         "domain_rand.randomize_friction",
         "domain_rand.randomize_base_mass",
