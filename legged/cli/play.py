@@ -19,8 +19,7 @@ from legged.commandline.arguments import (
     watch_command,
 )
 from legged.commandline.command import sub_command
-from legged.config import override
-from legged.config.capabilities import follows_velocities
+from legged.config import follows_velocities, override
 from legged.deploy.command_parser import argument
 from legged.envs import is_velocity_task
 from legged.errors import ConfigError, RunError

@@ -4,11 +4,13 @@ Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same de
 """
 
 from dataclasses import dataclass, field
+from typing import TypeGuard
 
 from legged.config.bounds import LARGEST, LONGEST_S, UNIT, between, positive, quantity, rescaled, rescaled_by_term
 from legged.config.mdp import ObservationGroupConfig, Range
 from legged.config.robot import MOTION, RobotConfig, RobotObservationsConfig, RobotRewardsConfig
 from legged.config.section import Section
+from legged.config.task import TaskConfig
 
 FASTEST = 20.0
 """Largest command of an evaluation [m/s, rad/s]. Reason: the area of the terrain grows with the square of the command."""
@@ -141,3 +143,8 @@ class LeggedConfig(RobotConfig):
     """Observations of policy and value function."""
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     """Settings of evaluations."""
+
+
+def follows_velocities(cfg: TaskConfig) -> TypeGuard[LeggedConfig]:
+    """Return whether the robots follow velocity commands, so that a grid of commands can measure them."""
+    return isinstance(cfg, LeggedConfig)

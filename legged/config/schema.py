@@ -1,3 +1,4 @@
+# ruff: noqa: F401  (names for other modules)
 """Configuration schema: every setting of a task file, with meaning, unit, default and bounds.
 
 A file under `cfg/` states only the differences from the defaults. The sections of every task are in world.py, mdp.py and
@@ -34,6 +35,7 @@ from legged.config.mdp import (
 )
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.config.robot import (
+    HeightMapConfig,
     InitStateConfig,
     RobotConfig,
     RobotControlConfig,
@@ -43,47 +45,5 @@ from legged.config.robot import (
     RobotTerminationsConfig,
     TerrainConfig,
 )
-from legged.config.sensors import HeightMapConfig
 from legged.config.task import TaskConfig
 from legged.config.world import EnvConfig, NewtonSolver, SimConfig
-
-__all__ = [
-    "STATE_TERMS",
-    "ActuatorConfig",
-    "AlgorithmConfig",
-    "CommandCurriculumConfig",
-    "CommandRanges",
-    "CommandsConfig",
-    "ControlConfig",
-    "DistillationConfig",
-    "DomainRandConfig",
-    "DrawConfig",
-    "EnvConfig",
-    "EstimatorConfig",
-    "EvaluationConfig",
-    "ForceConfig",
-    "HeightMapConfig",
-    "InitStateConfig",
-    "KickConfig",
-    "LeggedConfig",
-    "LeggedObservationsConfig",
-    "LeggedRewardsConfig",
-    "NewtonSolver",
-    "ObservationGroupConfig",
-    "ObservationsConfig",
-    "PolicyConfig",
-    "Range",
-    "RewardsConfig",
-    "RobotConfig",
-    "RobotControlConfig",
-    "RobotDomainRandConfig",
-    "RobotObservationsConfig",
-    "RobotRewardsConfig",
-    "RobotTerminationsConfig",
-    "RunnerConfig",
-    "SimConfig",
-    "TaskConfig",
-    "TerminationsConfig",
-    "TerrainConfig",
-    "TrainConfig",
-]

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import get_args
 
-from legged.config.capabilities import follows_velocities
+from legged.config.legged import follows_velocities
 from legged.config.networks import check_networks, learns_from_teacher
 from legged.config.schema import TaskConfig
 from legged.envs.class_checks import check_overrides, check_terms

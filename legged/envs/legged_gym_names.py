@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from legged.envs.class_checks import names_in
-from legged.envs.views import ReadOnly
+from legged.envs.views import ReadOnly, Wide
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
 from legged.robots.stance import lowest_point, stance
 
@@ -337,6 +337,13 @@ class LeggedGymNames:
             vars(self).setdefault("_kept_names", []).append(name)
             return kept
         raise AttributeError(f"is not there; {ABSENT[name]}")
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()  # type: ignore[misc]
+        task: Any = self
+        default, last = task.default_dof_pos, task.last_actions
+        task.default_dof_pos = Wide.of(default, lambda: default.unsqueeze(0))
+        task.last_actions = Wide.of(last, lambda: torch.stack([last, task.last_last_actions], dim=2))
 
     def apply_control(self) -> None:
         self._store_substep()

@@ -8,14 +8,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.capabilities import follows_velocities
+from legged.config.legged import follows_velocities
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_grid
 from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.robot_task import RobotTask
 from legged.envs.velocity_terms import VelocityTerms
-from legged.envs.views import Wide
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 
@@ -39,9 +38,6 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         """Allocate tensors and parts for the robot, its ground, its commands and their curriculum."""
         super()._init_buffers()
         cfg, kernels = self.cfg, self.physics.kernels
-        default, last = self.default_dof_pos, self.last_actions
-        self.default_dof_pos = Wide.of(default, lambda: default.unsqueeze(0))
-        self.last_actions = Wide.of(last, lambda: torch.stack([last, self.last_last_actions], dim=2))
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 

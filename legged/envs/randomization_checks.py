@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from legged.config.capabilities import has_robot
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
+from legged.config.robot import has_robot
 from legged.config.schema import RobotConfig, TaskConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observed_forces
 from legged.errors import ConfigError, suggest

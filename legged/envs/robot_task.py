@@ -8,10 +8,9 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.capabilities import has_robot
+from legged.config.robot import has_robot
 from legged.config.schema import RobotConfig, TaskConfig
 from legged.envs.base_task import BaseTask
-from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms
 from legged.math import evenly_spaced, quat_rotate
@@ -60,11 +59,9 @@ class RobotTask(RobotTerms, BaseTask):
         Raises:
             ConfigError: the configuration is invalid for this task.
         """
-        check_overrides(cls)  # comes first, because a wrong override can make other checks fail
-        assert has_robot(cfg)
-        robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
-        check_legged(cls, cfg, robot)
+        assert has_robot(cfg)
+        check_legged(cls, cfg, load_robot(cfg.robot, cfg.origins.where("robot")))
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
@@ -110,7 +107,6 @@ class RobotTask(RobotTerms, BaseTask):
         steps = cfg.train.runner.num_steps_per_env
         self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
-        self._vary_control()
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.make_commands()
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels, contact_force(robot.mass))
@@ -124,7 +120,7 @@ class RobotTask(RobotTerms, BaseTask):
         self.dof_vel_limits = self._nominal_vel_limits
         if "velocity_limit" in self.randomization.draws:
             self.dof_vel_limits = torch.zeros_like(self.dof_vel)
-        self._vary_velocity_limits()
+        self._vary()
         self.dof_pos_limits = self._soft_limits(robot)
         self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
@@ -261,29 +257,24 @@ class RobotTask(RobotTerms, BaseTask):
 
     def redraw(self, mask: Tensor) -> None:
         super().redraw(mask)
-        self._vary_control(again=True)
-        self._vary_velocity_limits(again=True)
+        self._vary(again=True)
 
-    def _vary_control(self, again: bool = False) -> None:
-        """Apply randomised properties to the control law; with `again`, only those with `when: reset` or `interval`."""
-        names = self.randomization.redrawn if again else self.randomization.draws
-        drawn = self.randomization.fields
-        self.control.vary({name: drawn[name] for name in names})
-
-    def _vary_velocity_limits(self, again: bool = False) -> None:
-        """Apply the randomised `velocity_limit` to `dof_vel_limits` and to the no-load speeds of motors; with `again`, only
-        if it has `when: reset` or `interval`.
+    def _vary(self, again: bool = False) -> None:
+        """Apply randomised properties to the control law, and `velocity_limit` to `dof_vel_limits` and to the no-load speeds
+        of motors; with `again`, only properties with `when: reset` or `interval`.
         """
-        if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
-            factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
+        drawn = self.randomization.fields
+        names = self.randomization.redrawn if again else self.randomization.draws
+        self.control.vary({name: drawn[name] for name in names})
+        if "velocity_limit" in names:
+            factor = drawn["velocity_limit"].view(self.num_envs, -1)
             torch.mul(self._nominal_vel_limits, factor, out=self.dof_vel_limits)
             if self.control.actuator is not None:
                 self.control.actuator.curve.vary(factor)
 
     def apply_randomization(self) -> None:
         super().apply_randomization()
-        self._vary_control()
-        self._vary_velocity_limits()
+        self._vary()
 
     def pushed_by_forces(self) -> bool:
         return bool(self.cfg.domain_rand.forces)

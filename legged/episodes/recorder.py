@@ -219,7 +219,8 @@ def record_episodes(
         TermError: the step cannot be captured.
     """
     progress = copy.deepcopy(task.progress())
-    record = watch_steps(task, StepRecord(task), graph)
+    record = StepRecord(task)
+    watch_steps(task, record.take, graph)
     task.load_progress(progress)  # watch_steps has set curricula back to their start
     if place is not None:
         place()

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.config import RobotConfig, TaskConfig
-from legged.config.capabilities import has_robot
+from legged.config import RobotConfig, TaskConfig, has_robot
 from legged.envs import RobotTask
 from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type, tile_size

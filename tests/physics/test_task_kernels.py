@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.robot import HeightMapConfig
 from legged.config.schema import (
     CommandCurriculumConfig,
     CommandsConfig,
@@ -15,7 +16,6 @@ from legged.config.schema import (
     RobotDomainRandConfig,
     TerrainConfig,
 )
-from legged.config.sensors import HeightMapConfig
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
