@@ -134,8 +134,7 @@ def _on_ground(
     terrain = None
     if playground:
         changes += playground.changes(cfg)
-        changed: Any = override(policy.cfg, changes)
-        terrain = playground.build(changed)
+        terrain = playground.build(override(cfg, changes))
     ready_to_write(folder, ROOM_MB)
     task, act = restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
     if playground:

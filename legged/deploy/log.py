@@ -113,8 +113,8 @@ def check_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder, buffering=0) as probe:
             probe.write(bytes(2**20))
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"--log: cannot write to the folder {folder}: {_reason(error)}") from error
+    except OSError as error:
+        raise ConfigError(f"--log: cannot write to the folder {folder}: {error.strerror or error}") from error
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -125,18 +125,13 @@ def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """
     part = path.with_name(f".{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
         part.replace(path)
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
-        raise RunError(f"{path}: cannot be written: {_reason(error)}") from error
-
-
-def _reason(error: OSError | ValueError) -> str:
-    return getattr(error, "strerror", None) or str(error)
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:

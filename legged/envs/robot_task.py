@@ -54,11 +54,6 @@ class RobotTask(RobotTerms, BaseTask):
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> None:
-        """Check a configuration completely, before anything is built.
-
-        Raises:
-            ConfigError: the configuration is invalid for this task.
-        """
         super().check(cfg)
         assert has_robot(cfg)
         check_legged(cls, cfg, load_robot(cfg.robot, cfg.origins.where("robot")))

@@ -62,7 +62,7 @@ def place_to_track(
     if cfg.terrain.mesh_type == "plane":
         return [*changes, *asked], None
     changes += [*on_terrain(cfg, rough_side(grid), ROUGH_SPAWN), *asked]
-    rough: Any = override(cfg, changes)
+    rough = override(cfg, changes)
     return changes, rough_ground(rough.terrain, rough.env.seed)
 
 

@@ -129,7 +129,7 @@ def film(policy: TrainedPolicy, side: int) -> Film:
     terrain = None
     if playground is not None:
         changes += [*SETTING, *playground.changes(cfg)]
-        terrain = playground.build(override(cfg, changes))  # type: ignore[arg-type]
+        terrain = playground.build(override(cfg, changes))
     task, act = restore(policy, changes, torch.device("cpu"), graph=False, terrain=terrain)
     camera = RobotsCamera(task, 1, SHARP * side, SHARP * side)
     camera.come_near(FILL, GLIDE)

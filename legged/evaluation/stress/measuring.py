@@ -196,7 +196,7 @@ class Bench:
     def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
         """Let robots walk out of tiles of all `specs`; return outcomes (N,) and times (N,) [s]. For `last` see `_build`."""
         own = to_run_out(self.cfg, len(rows))
-        cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
+        cfg = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
         scores, lost = run_out(task, act, len(rows) // len(specs))
         self.lost += lost
