@@ -1,8 +1,6 @@
 """Errors of the package: those that end a command with one line, and those of a task's terms and steps."""
 
-from legged.deploy.errors import LONGEST, ConfigError, RunError, one_line, suggest
-
-__all__ = ["LONGEST", "ConfigError", "HostReadError", "RunError", "TermError", "one_line", "suggest"]
+from legged.deploy.errors import LONGEST, ConfigError, RunError, one_line, suggest  # noqa: F401  (names for other modules)
 
 
 class TermError(RuntimeError):

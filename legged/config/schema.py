@@ -6,44 +6,10 @@ learning.py. Those of a task with a robot are in robot.py, and those of velocity
 """
 
 from legged.config.actuator import ActuatorConfig
-from legged.config.learning import (
-    AlgorithmConfig,
-    DistillationConfig,
-    EstimatorConfig,
-    PolicyConfig,
-    RunnerConfig,
-    TrainConfig,
-)
-from legged.config.legged import (
-    STATE_TERMS,
-    CommandCurriculumConfig,
-    CommandRanges,
-    CommandsConfig,
-    EvaluationConfig,
-    LeggedConfig,
-    LeggedObservationsConfig,
-    LeggedRewardsConfig,
-)
-from legged.config.mdp import (
-    ControlConfig,
-    DomainRandConfig,
-    ObservationGroupConfig,
-    ObservationsConfig,
-    Range,
-    RewardsConfig,
-    TerminationsConfig,
-)
+from legged.config.learning import PolicyConfig, RunnerConfig
+from legged.config.legged import STATE_TERMS, CommandCurriculumConfig, CommandRanges, CommandsConfig, LeggedConfig
+from legged.config.mdp import ObservationGroupConfig, Range
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
-from legged.config.robot import (
-    HeightMapConfig,
-    InitStateConfig,
-    RobotConfig,
-    RobotControlConfig,
-    RobotDomainRandConfig,
-    RobotObservationsConfig,
-    RobotRewardsConfig,
-    RobotTerminationsConfig,
-    TerrainConfig,
-)
+from legged.config.robot import HeightMapConfig, RobotConfig, RobotControlConfig, RobotDomainRandConfig, TerrainConfig
 from legged.config.task import TaskConfig
-from legged.config.world import EnvConfig, NewtonSolver, SimConfig
+from legged.config.world import NewtonSolver, SimConfig

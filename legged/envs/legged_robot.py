@@ -26,7 +26,6 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     """
 
     Config: ClassVar[type[TaskConfig]] = LeggedConfig
-    cfg: LeggedConfig
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> None:
