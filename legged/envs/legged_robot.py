@@ -26,6 +26,7 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     """
 
     Config: ClassVar[type[TaskConfig]] = LeggedConfig
+    cfg: LeggedConfig
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> None:
