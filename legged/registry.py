@@ -165,9 +165,10 @@ def _schema_of(kind: type[BaseTask]) -> type[TaskConfig]:
     """Return the configuration schema of a task class.
 
     Raises:
-        ConfigError: `Config` is not a frozen dataclass that extends the schema of RobotTask or BaseTask.
+        ConfigError: `Config` is not a frozen dataclass that extends the schema of the class's nearest parent in this package.
     """
-    base, schema = (RobotTask if issubclass(kind, RobotTask) else BaseTask).Config, kind.Config
+    ours: Any = next(part for part in kind.__mro__ if part.__module__.startswith("legged."))
+    base, schema = ours.Config, kind.Config
     # Without @dataclass, the fields that a class adds would be ignored silently.
     decorated = isinstance(schema, type) and "__dataclass_fields__" in vars(schema)
     if not decorated or not issubclass(schema, base):

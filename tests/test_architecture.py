@@ -3,6 +3,8 @@
 import ast
 import functools
 import sys
+from collections.abc import Iterable, Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -23,14 +25,14 @@ def name_of(path: Path) -> str:
 
 @functools.cache
 def imports(path: Path) -> set[str]:
-    """Modules that a file imports anywhere in it, functions and annotations included, as dotted names."""
+    """What a file imports anywhere in it, functions and annotations included, as dotted names: `a.b` of `from a import b`."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
     return found
 
 
@@ -60,6 +62,7 @@ def test_warp_is_known_to_the_physics_and_to_the_graph_only():
 
 
 FLOORS = [  # from the ground up; each part imports from the floors below it only
+    {"deploy"},  # a robot's computer runs a copy of this folder alone
     {"errors", "math", "state"},
     {"process"},
     {"graph", "config", "figures", "tables"},
@@ -70,7 +73,7 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"user_modules", "gymnasium_ids"},
     {"registry"},
     {"commandline"},
-    {"learning", "rendering", "deploy"},
+    {"learning", "rendering"},
     {"policies", "gymnasium_envs"},
     {"play"},
     {"evaluation"},
@@ -79,12 +82,10 @@ FLOORS = [  # from the ground up; each part imports from the floors below it onl
     {"cli"},
 ]
 PARTS = sorted({name_of(path).split(".")[1] for path in FILES if name_of(path) not in ("legged", "legged.__main__")})
-OF_ROBOTS = ("deploy", "errors", "process")
-"""What a robot's computer runs; `process` imports no torch either."""
 WITHOUT = {  # what else a part does without
     "errors": ["torch"],
     "process": ["torch"],
-    "deploy": ["torch", "mujoco", "yaml", *(f"legged.{part}" for part in PARTS if part not in OF_ROBOTS)],
+    "deploy": ["torch", "mujoco", "yaml", *(f"legged.{part}" for part in PARTS if part != "deploy")],
     "config": ["torch"],
     "robots": ["torch"],
     "terrain": ["torch", "mujoco"],
@@ -109,6 +110,56 @@ def test_imports_point_one_way(part):
     files = [path for path in FILES if name_of(path).split(".")[1:2] == [part]]
     found = {name_of(path): uses(path, *(f"legged.{other}" for other in above)) for path in files}
     assert not {name: modules for name, modules in found.items() if modules}
+
+
+def circle_in(graph: Mapping[str, Iterable[str]]) -> list[str]:
+    """Nodes of a circle, from a node back to itself; empty without a circle."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+@functools.cache
+def files_imported() -> dict[str, set[str]]:
+    """File -> files that it imports, also within functions and for annotations only, as dotted names."""
+    names = {name_of(path) for path in FILES}
+    found = {}
+    for path in FILES:
+        files = {name if name in names else name.rpartition(".")[0] for name in imports(path)}
+        found[name_of(path)] = files & names - {name_of(path)}
+    return found
+
+
+def test_a_circle_is_found():
+    assert circle_in({"a": ["b"], "b": ["c"], "c": []}) == []
+    assert set(circle_in({"a": ["b"], "b": ["c"], "c": ["a"]})) == {"a", "b", "c"}
+    # The graph has imports at the top, in functions, of names in packages, and for annotations.
+    graph = files_imported()
+    assert "legged.envs.base_task" in graph["legged.envs.final_observation"]
+    assert "legged.physics.warp.mujoco_warp" in graph["legged.physics"]
+    assert "legged.learning.fused_update.update" in graph["legged.learning.ppo"]
+
+
+def test_no_files_import_each_other_in_a_circle():
+    assert not circle_in(files_imported())
+
+
+def test_no_folders_side_by_side_import_each_other_in_a_circle():
+    """Folders within a part, such as those of the engines; FLOORS orders the parts."""
+    folders = {name_of(path.parent / "__init__.py") for path in FILES if len(name_of(path).split(".")) > 3}
+
+    def folder(name: str) -> str:
+        return name if name in folders else name.rpartition(".")[0]
+
+    graph: dict[str, set[str]] = {name: set() for name in folders}
+    for name, others in files_imported().items():
+        if folder(name) in folders:
+            graph[folder(name)] |= {folder(other) for other in others} & folders - {folder(name)}
+    assert {"legged.physics.warp", "legged.physics.fused", "legged.play.live"} <= folders
+    assert "legged.physics.fused" in graph["legged.physics.warp"]
+    assert not circle_in(graph)
 
 
 @pytest.mark.slow

@@ -18,8 +18,9 @@ from legged.cli.evaluate import grid, terrain
 from legged.cli.main import COMMANDS, load, split
 from legged.cli.play import play
 from legged.cli.train import train
+from legged.commandline.command import OF_LEGGED_GYM
 from legged.deploy import __main__ as program
-from legged.process.command_parser import CommandParser
+from legged.deploy.command_parser import CommandParser
 from legged.registry import import_tasks, make_task, task_config
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -148,7 +149,8 @@ def mistake(command: Shown) -> str:
         return ""
     with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.redirect_stdout(said):
         try:
-            args = parser.parse_intermixed_args(rest)
+            hyphened = [OF_LEGGED_GYM.sub(lambda option: option[0].replace("_", "-"), word) for word in rest]
+            args = parser.parse_intermixed_args(hyphened)
         except SystemExit as stop:
             text = said.getvalue().strip().splitlines()[-1]
             unfinished = not command.in_a_block and "arguments are required" in text

@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 
+from legged.commandline.arguments import IMPORT
 from legged.commandline.command import run_main
+from legged.deploy.command_parser import CommandParser, check_between, check_number
 from legged.errors import ConfigError
 from legged.play.films import Film, film, walker, write_film
 from legged.policies.restore import TrainedPolicy, policy_of
-from legged.process.command_parser import IMPORT, CommandParser, check_between, check_number
 from legged.process.paths import ready_to_write
 from legged.registry import import_tasks
 from legged.rendering.camera import INK

@@ -19,10 +19,11 @@ import tables
 from shipping import ship
 
 from legged.cli.evaluate import ROBOTS, check_points
-from legged.commandline.arguments import pick_device
+from legged.commandline.arguments import IMPORT, pick_device
 from legged.commandline.command import EXIT_FAILED, run_main, stopping_on_signals
-from legged.config import LeggedConfig, parse_override, to_dict
+from legged.config import LeggedConfig, follows_velocities, parse_override, to_dict
 from legged.config.dotted import differences
+from legged.deploy.command_parser import CommandParser, check_number
 from legged.errors import ConfigError
 from legged.evaluation.engines import engine_of
 from legged.evaluation.reports.record import NAMES, Record, folders_in, read_record
@@ -31,7 +32,6 @@ from legged.evaluation.success import TYPES_HELP, chosen_sizes, types_in
 from legged.evaluation.velocity_grid import axes_of
 from legged.learning.run_folder import CONFIG_FILE, experiment_folder, run_config
 from legged.physics import engine_name
-from legged.process.command_parser import IMPORT, CommandParser, check_number
 from legged.process.paths import ready_to_write, relative
 from legged.process.processes import child_environment
 from legged.registry import import_tasks, task_config
@@ -137,7 +137,7 @@ def plan(args: argparse.Namespace) -> list[Training]:
         for name in names:
             changes = [*map(parse_override, overrides(args)), ("env.seed", seed)]
             cfg = task_config(name, changes, on_cpu=device.type == "cpu")
-            if not isinstance(cfg, LeggedConfig):
+            if not follows_velocities(cfg):
                 raise ConfigError(f"'{name}' follows no commands; the table has only tasks that do")
             own = engine_name(cfg.sim, device, num_envs=cfg.env.num_envs)
             flat = cfg.terrain.mesh_type == "plane"

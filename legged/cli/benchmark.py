@@ -22,8 +22,9 @@ from torch import Tensor
 
 from legged.commandline.arguments import TASK, overrides, pick_device, register_given, settle_on
 from legged.commandline.command import EXIT_WRONG_INPUT, LACKS_MEMORY, sub_command
-from legged.config import LeggedConfig, TaskConfig, override
+from legged.config import TaskConfig, has_robot, override
 from legged.config.networks import learns_from_teacher
+from legged.deploy.command_parser import argument, check_number
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.evaluation.result_file import write_result
@@ -37,7 +38,6 @@ from legged.learning.teacher import Teacher, find_teacher, with_teacher
 from legged.physics import resolve_physics
 from legged.policies.actor import Actor
 from legged.policies.restore import policy_of
-from legged.process.command_parser import argument, check_number
 from legged.process.paths import ready_to_write, relative
 from legged.process.startup import STAGES_FILE
 from legged.registry import make_task, task_config
@@ -252,7 +252,7 @@ def ground(args: argparse.Namespace) -> int:
     where = cfg.origins.where("sim.physics")
     if resolve_physics(cfg.sim.physics, device, where, cfg.env.num_envs) != "mujoco_warp":
         raise ConfigError(f"{where}: this command compares colliders of mujoco_warp; add sim.physics=mujoco_warp")
-    if not isinstance(cfg, LeggedConfig) or cfg.terrain.mesh_type == "plane":
+    if not has_robot(cfg) or cfg.terrain.mesh_type == "plane":
         raise ConfigError(f"TASK: '{cfg.task}' has no terrain")
     settle_on(device)
     results = {}

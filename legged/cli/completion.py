@@ -10,9 +10,9 @@ import shtab
 from legged.cli.main import COMMANDS, load
 from legged.commandline.command import sub_command
 from legged.config.reference import fields
-from legged.envs import BaseTask, RobotTask
+from legged.deploy.command_parser import argument
+from legged.envs import BaseTask
 from legged.physics.fields import FIELDS
-from legged.process.command_parser import argument
 from legged.process.paths import data_folder
 from legged.registry import CLASSES
 from legged.terrain import TERRAIN_TYPES
@@ -103,9 +103,8 @@ def keys_of(kinds: Iterable[type[BaseTask]]) -> list[str]:
             "observations.scales": kind.terms("_obs_"),
             "observations.noise": kind.terms("_obs_"),
             "domain_rand.ranges": FIELDS,
+            **dict.fromkeys(("terrain.proportions", "terrain.sizes"), TERRAIN_TYPES),
         }
-        if issubclass(kind, RobotTask):
-            entries |= {"terrain.proportions": TERRAIN_TYPES, "terrain.sizes": TERRAIN_TYPES}
         for text in fields(kind.Config):
             if not text.is_section:
                 found |= {f"{text.path.replace('<name>', group)}=" for group in ("actor", "critic")}

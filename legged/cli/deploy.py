@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.commandline.arguments import POLICY_HELP, import_given
+from legged.commandline.arguments import IMPORT, POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
-from legged.config import LeggedConfig, parse_override
+from legged.config import follows_velocities, has_robot, parse_override
 from legged.config.schema import SimConfig, TerrainConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
+from legged.deploy.command_parser import argument, check_between
 from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError, RunError
@@ -24,7 +25,6 @@ from legged.mdp.actuator import with_rotors
 from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import IMPORT, argument, check_between
 from legged.process.paths import exists, make_folder, ready_to_write, relative, replacing, write_text
 from legged.process.startup import INTERRUPTED, in_main_thread
 from legged.rendering.camera import Camera, Follower, caption, size_of
@@ -221,10 +221,10 @@ def _exported(name: str) -> Path:
         if not saved or saved[max(saved)].stat().st_mtime <= inside.stat().st_mtime:
             return given / EXPORTED
     policy = policy_of(name)
-    if not isinstance(policy.cfg, LeggedConfig):
+    if not follows_velocities(policy.cfg):
         raise ConfigError(f"POLICY: '{policy.cfg.task}' follows no commands; give a policy that follows velocity commands")
     folder = policy.output("deploy") / EXPORTED
-    changes = [*undisturbed(1, 1.0), ("sim.physics", "mujoco")]
+    changes = [*undisturbed(policy.cfg, 1), ("sim.physics", "mujoco")]
     task, act = restore(policy, changes, torch.device("cpu"), graph=False)
     export(task, act.network, folder, trained=policy.cfg)
     print(f"exported {relative(folder / 'policy.onnx')}")
@@ -240,7 +240,7 @@ def _simulated(given: str | None, exported: Path, contract: Contract) -> Robot:
     for folder in exported.absolute().parents[:2]:  # the run folder is one or two levels above `exported`
         if exists(folder / CONFIG_FILE):
             cfg = run_config(folder)
-            if isinstance(cfg, LeggedConfig) and Path(cfg.robot).name == contract.robot:
+            if has_robot(cfg) and Path(cfg.robot).name == contract.robot:
                 return load_robot(cfg.robot, "--robot")
     try:
         return load_robot(contract.robot)

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from legged.commandline.arguments import (
     BUILD,
+    IMPORT,
     POLICY,
     POLICY_HELP,
     import_given,
@@ -18,6 +19,7 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import sub_command
 from legged.config import TaskConfig
+from legged.deploy.command_parser import Argument, argument, check_number
 from legged.episodes.joint_statistics import joint_statistics, tables_of, write_statistics
 from legged.episodes.page import Projector, write_page
 from legged.episodes.ranking import COLUMNS, FELL, check_ended, counts_text, figures_of, listing, order_of
@@ -36,7 +38,6 @@ from legged.episodes.stored import (
 from legged.errors import ConfigError, suggest
 from legged.evaluation.reports.document import text_of
 from legged.policies.restore import TrainedPolicy, policy_of
-from legged.process.command_parser import IMPORT, Argument, argument, check_number
 from legged.process.paths import exists, ready_to_write, relative, write_text
 from legged.tables import markdown_table, screen_table
 

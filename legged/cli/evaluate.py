@@ -12,7 +12,8 @@ from rich.table import Table
 from legged.cli.main import hint_at_sub_command
 from legged.commandline.arguments import POLICY, measuring_device, policy_overrides, register_given, velocity_command
 from legged.commandline.command import sub_command
-from legged.config import LeggedConfig
+from legged.config import follows_velocities
+from legged.deploy.command_parser import Argument, argument, check_between, check_number
 from legged.errors import ConfigError, suggest
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes, evaluate_in_gymnasium
 from legged.evaluation.following import (
@@ -33,7 +34,6 @@ from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axes_
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
 from legged.policies.restore import policy_of
-from legged.process.command_parser import Argument, argument, check_between, check_number
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
 from legged.tables import screen_table
@@ -96,7 +96,7 @@ def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
         raise ConfigError("--num-envs: leave it out, because the evaluation chooses the number of robots")
     device, policy = measuring_device(args), policy_of(args.policy, args.checkpoint)
     task = policy.cfg.task
-    if follows and not isinstance(policy.cfg, LeggedConfig):
+    if follows and not follows_velocities(policy.cfg):
         raise ConfigError(f"POLICY: '{task}' has no velocity commands; use `legged evaluate episodes {task}`")
     overrides = policy_overrides(args)
     own = policy.output("evaluate")
@@ -135,7 +135,7 @@ def evaluate(args: argparse.Namespace) -> int:
     with hint_at_sub_command("evaluate", [args.policy]):
         setting = _settle(args, follows=False)
     cfg = setting.policy.cfg
-    if not isinstance(cfg, LeggedConfig):
+    if not follows_velocities(cfg):
         return evaluate_episodes(setting, ENVIRONMENTS)
     sizes = chosen_sizes(cfg, None, False, setting.cfg.terrain.scale)
     return evaluate_following(setting, _grid_of(setting), sizes, check_points(None, False))
@@ -271,7 +271,7 @@ def episodes(args: argparse.Namespace) -> int:
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
     setting = _settle(args, follows=False)
-    if isinstance(setting.policy.cfg, LeggedConfig):
+    if follows_velocities(setting.policy.cfg):
         task = setting.policy.cfg.task
         raise ConfigError(f"POLICY: '{task}' follows velocity commands; use `legged evaluate grid {task}`")
     return evaluate_episodes(setting, args.episodes)

@@ -7,13 +7,12 @@ import torch
 
 from legged.commandline.arguments import POLICY, policy_overrides, register_given, settle_on
 from legged.commandline.command import sub_command
-from legged.config import LeggedConfig
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
 from legged.policies import export as exporting
 from legged.policies.restore import policy_of, restore, undisturbed
-from legged.process.command_parser import argument
 from legged.process.paths import ready_to_write, relative
 
 MEGABYTES = 5.0
@@ -52,8 +51,7 @@ def export(args: argparse.Namespace) -> int:
     folder = args.out or policy.output("export") / exporting.EXPORTED
     ready_to_write(folder, MEGABYTES * len(paths))
     # An export simulates nothing. A task with one robot in C MuJoCo is built fastest, because it needs no kernels.
-    calm = undisturbed(1, 1.0) if isinstance(policy.cfg, LeggedConfig) else [("env.num_envs", 1)]
-    changes = [*calm, ("sim.physics", "mujoco"), *policy_overrides(args)]
+    changes = [*undisturbed(policy.cfg, 1), ("sim.physics", "mujoco"), *policy_overrides(args)]
     task, act = restore(policy, changes, device, graph=False)
     for path in paths.values():
         training: dict[str, float] = {"iterations": act.load(path)}

@@ -10,11 +10,11 @@ import numpy as np
 
 from legged.commandline.command import sub_command
 from legged.config.yaml_files import dump
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.figures import figure
 from legged.fitting.log import ActuatorLog, check_alike, read_log
 from legged.fitting.parametric import Drive, fit_drive
-from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 
 UPDATES = {"mlp": 2000, "lstm": 3000}

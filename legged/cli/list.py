@@ -6,7 +6,7 @@ from pathlib import Path
 
 from legged.cli.main import print_rows
 from legged.commandline.command import sub_command
-from legged.process.command_parser import argument
+from legged.deploy.command_parser import argument
 from legged.process.paths import data_folder
 
 

@@ -9,13 +9,13 @@ from typing import Any
 from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.yaml_files import read_yaml
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.migration.mapping import map_settings
 from legged.migration.reading import read_fork
 from legged.migration.robot_entries import asset_of, map_robot, names_of
 from legged.migration.translation import Translation
 from legged.migration.writer import robot_yaml, task_yaml
-from legged.process.command_parser import argument
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.robot import Robot, load_robot

@@ -19,8 +19,9 @@ from legged.commandline.arguments import (
     watch_command,
 )
 from legged.commandline.command import sub_command
-from legged.config import LeggedConfig, override
-from legged.envs import LeggedRobot
+from legged.config import follows_velocities, override
+from legged.deploy.command_parser import argument
+from legged.envs import is_velocity_task
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import find_run, run_config
 from legged.play.demonstrations import EPISODE_S, SCHEDULE, follow_schedule, roll_out, walk_out
@@ -31,7 +32,6 @@ from legged.policies.actor import Actor
 from legged.policies.episodes import for_episodes
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import TrainedPolicy, policy_of, restore, undisturbed
-from legged.process.command_parser import argument
 from legged.process.headless import HEADLESS
 from legged.process.paths import ready_to_write, relative
 from legged.registry import task_config
@@ -76,16 +76,7 @@ def play(args: argparse.Namespace) -> int:
     if isinstance(count, int) and count > MOST_ROBOTS:
         raise ConfigError(f"--num-envs: must be from 1 to {MOST_ROBOTS}, got {count}; a film shows at most {MOST_SHOWN}")
     folder = args.out or policy.output("play")
-    if isinstance(policy.cfg, LeggedConfig):
-        playground, task, act = _on_ground(args, policy, asked, device, folder)
-    else:
-        for flag in ("terrain", "difficulty"):
-            if getattr(args, flag) is not None:
-                raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose; its model contains the ground")
-        playground = None
-        policy, changes = for_episodes(policy, args.num_envs if args.num_envs is not None else SHOWN_ON_A_PLANE)
-        ready_to_write(folder, ROOM_MB)
-        task, act = restore(policy, [*changes, *asked], device, not args.no_graph)
+    playground, task, act = _on_ground(args, policy, asked, device, folder)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
     differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
@@ -105,7 +96,7 @@ def play(args: argparse.Namespace) -> int:
         video = Video(task, shown, None if args.no_video else folder, args.gif)
     except RunError as error:  # this machine cannot render, but the policy is still measured
         video, failure = Video(task, shown, None), error
-    if not isinstance(task, LeggedRobot):
+    if not is_velocity_task(task):
         result = roll_out(task, act, video)
     else:
         result = walk_out(task, act, playground, video) if playground else follow_schedule(task, act, video)
@@ -130,16 +121,22 @@ def _named(args: argparse.Namespace) -> str:
 
 def _on_ground(
     args: argparse.Namespace, policy: TrainedPolicy, asked: list[tuple[str, Any]], device: torch.device, folder: Path
-) -> tuple[Playground | None, LeggedRobot, Actor]:
-    """Build a task of legged robots on a playground or plane. Return playground (None: plane), task and policy."""
-    wanted: LeggedConfig = override(policy.cfg, asked)  # type: ignore[assignment]
-    playground = Playground.of(wanted, args.terrain, args.difficulty)
-    count = args.num_envs if args.num_envs is not None else len(playground.order) if playground else SHOWN_ON_A_PLANE
-    seconds = EPISODE_S if playground else sum(seconds for seconds, _ in SCHEDULE)
-    changes = [*undisturbed(count, seconds), *(SETTING if playground else ()), *asked, ("env.num_envs", count)]
+) -> tuple[Playground | None, Any, Actor]:
+    """Build a policy's task on a playground, a plane, or the ground of its model. Return playground, task and policy."""
+    cfg: Any = override(policy.cfg, asked)
+    playground = Playground.of(cfg, args.terrain, args.difficulty)
+    count = len(playground.order) if playground else SHOWN_ON_A_PLANE
+    if follows_velocities(policy.cfg):
+        changes = undisturbed(cfg, count, EPISODE_S if playground else sum(seconds for seconds, _ in SCHEDULE))
+    else:
+        changes = for_episodes(cfg, count)
+    changes += [*(SETTING if playground else ()), *asked]
     terrain = None
     if playground:
-        changes += playground.changes(wanted)
-        terrain = playground.build(override(policy.cfg, changes))  # type: ignore[arg-type]
+        changes += playground.changes(cfg)
+        terrain = playground.build(override(cfg, changes))
     ready_to_write(folder, ROOM_MB)
-    return playground, *restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
+    task, act = restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
+    if playground:
+        playground.place(task)
+    return playground, task, act

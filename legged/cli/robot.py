@@ -14,9 +14,9 @@ from rich.table import Table
 
 from legged.commandline.command import sub_command
 from legged.config.checks import PLAIN, is_plain_name, shown
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError, suggest
 from legged.physics.standing import height_under_gains
-from legged.process.command_parser import argument
 from legged.process.paths import data_folder, exists, make_folder, ready_to_write, relative, write_text
 from legged.registry import register_file, task_config
 from legged.robots.importing.actuation import growth

@@ -8,9 +8,10 @@ import torch
 from rich.console import Console
 
 from legged.cli.main import hint_at_sub_command
-from legged.commandline.arguments import CHECKPOINT, import_given
+from legged.commandline.arguments import CHECKPOINT, IMPORT, import_given
 from legged.commandline.command import sub_command
-from legged.config import LeggedConfig
+from legged.config import follows_velocities
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError, RunError
 from legged.evaluation.learning_curves import Log, common_time, labels, levels, outcomes, read_config, read_scalars
 from legged.evaluation.reports.charts import draw_charts
@@ -33,7 +34,6 @@ from legged.evaluation.success import types_in
 from legged.learning.run_folder import CONFIG_FILE, LOGS, NOTE_FILE, find_checkpoint, own_run, run_config
 from legged.play.films import film, write_film
 from legged.policies.restore import TrainedPolicy
-from legged.process.command_parser import IMPORT, argument
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.process.startup import command_of_ours
 
@@ -134,7 +134,7 @@ def _film(folder: Path, checkpoint: int | str | None) -> str:
     """Film the policy of a run. Return the reason why there is no film, or an empty text if there is one."""
     try:
         cfg = run_config(folder)
-        if not isinstance(cfg, LeggedConfig):
+        if not follows_velocities(cfg):
             command = command_on(read_record(folder), "play")
             return f"'{cfg.task}' has no velocity commands; film it with `{command} --gif`"
         torch.set_num_threads(1)

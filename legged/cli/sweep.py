@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING
 import torch
 
 from legged.cli.train import train
-from legged.commandline.arguments import import_given, pick_device
+from legged.commandline.arguments import IMPORT, import_given, pick_device
 from legged.commandline.command import EXIT_FAILED, stopping_on_signals, sub_command
 from legged.config.checks import shown
+from legged.deploy.command_parser import argument, check_number
 from legged.errors import ConfigError
 from legged.learning.divergence import Diverged
 from legged.learning.evaluations import Evaluated, reaches
 from legged.learning.run_folder import NOTE_FILE
 from legged.learning.runner import Runner
-from legged.process.command_parser import IMPORT, argument, check_number
 from legged.process.cores import available_cores
 from legged.process.paths import make_folder, ready_to_write, relative, write_text
 from legged.process.processes import Job, WorkerPool, why_failed

@@ -9,9 +9,9 @@ from PIL import Image
 
 from legged.commandline.arguments import TASK, overrides, register_given
 from legged.commandline.command import sub_command
-from legged.config import LeggedConfig
+from legged.config import has_robot
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
-from legged.process.command_parser import argument
 from legged.process.paths import make_folder, ready_to_write, relative, replacing
 from legged.registry import task_config
 from legged.rendering.terrain_picture import draw_map, picture_of_types, tiles
@@ -38,7 +38,7 @@ def terrain(args: argparse.Namespace) -> int:
     if not 0.0 <= args.difficulty <= 1.0:
         raise ConfigError(f"--difficulty: must be between 0 and 1, got {args.difficulty:g}")
     cfg = task_config(args.task, overrides(args), on_cpu=True)
-    if not isinstance(cfg, LeggedConfig):
+    if not has_robot(cfg):
         raise ConfigError(f"TASK: '{args.task}' has no terrain to show, because its ground is part of its model")
     ready_to_write(args.out)
     if args.types is None:

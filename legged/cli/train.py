@@ -25,11 +25,12 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import EXIT_FAILED, quiet_writers, stopping_on_signals, sub_command, when_output_is_lost
 from legged.commandline.show import summary
-from legged.config import TaskConfig, to_yaml
+from legged.config import TaskConfig, follows_velocities, to_yaml
 from legged.config.networks import learns_from_teacher
+from legged.deploy.command_parser import argument
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
-from legged.evaluation.during_training import TrainingEvaluation, check_commands
+from legged.evaluation.during_training import TrainingEvaluation, few_commands
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.display import Display
@@ -46,7 +47,6 @@ from legged.learning.timing import Timing, write_timing
 from legged.learning.trackers import check_tracker
 from legged.learning.transfer import transferred
 from legged.physics import engine_name, resolve_physics
-from legged.process.command_parser import argument
 from legged.process.cores import available_cores
 from legged.process.neighbours import Neighbours
 from legged.process.paths import full_disk_in, ready_to_write, reason, relative, write_text
@@ -101,7 +101,8 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
         cfg = task_config(args.task, overrides(args), on_cpu)
     teacher = teacher_of(cfg, checkpoint, args)
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
-    check_commands(cfg)
+    if cfg.train.runner.evaluate_interval and follows_velocities(cfg):
+        few_commands(cfg)  # raises an error if evaluations would have no grid of commands
     check_tracker(cfg)
     _check_rewards(cfg)
     if args.show:

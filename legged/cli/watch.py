@@ -17,10 +17,10 @@ from legged.commandline.arguments import (
     settle_on,
 )
 from legged.commandline.command import sub_command
+from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.play.live.page import HOST, PORT, Page, free_port, is_loopback, load_viser, url
 from legged.play.live.session import MOST_ROBOTS, Session, changes_for, check_ground, find_watched
-from legged.process.command_parser import argument
 from legged.process.cores import available_cores
 
 ROBOTS = 4

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from legged.config import parse_override
+from legged.deploy.command_parser import Argument, argument
 from legged.errors import ConfigError
-from legged.process.command_parser import IMPORT, Argument, argument
 from legged.process.paths import relative
 from legged.process.ranks import Ranks
 from legged.process.startup import program
@@ -30,6 +30,23 @@ def _iteration(text: str) -> int | str:
         raise argparse.ArgumentTypeError(f"invalid value: '{text}' (allowed: an iteration, or best)") from None
 
 
+class Once(argparse.Action):
+    """Option that may be given once. If it were given twice, argparse would silently use the last value."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: Any = None
+    ) -> None:
+        """Store the value, or end the program if the option was given before."""
+        before = getattr(namespace, self.dest)
+        if before is not None:
+            parser.error(f"{option}: is given twice, {before} and {values}; write {option} {before},{values}")
+        setattr(namespace, self.dest, values)
+
+
+IMPORT = argument(
+    "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; join several by commas"
+)
+"""The option `--import`, for files and modules with user-defined tasks. `args.module` holds its value."""
 BUILD = (
     IMPORT,
     argument("--num-envs", type=int, help="number of robots (env.num_envs)"),

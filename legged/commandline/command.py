@@ -18,8 +18,8 @@ from types import FrameType
 from typing import Any, TextIO
 
 import legged.errors
+from legged.deploy.command_parser import Argument, CommandParser
 from legged.errors import ConfigError, HostReadError, RunError, TermError
-from legged.process.command_parser import Argument, CommandParser
 from legged.process.paths import DISK_FULL, full_disk_in, reason
 from legged.process.ranks import Ranks
 from legged.process.startup import (
@@ -36,6 +36,8 @@ EXIT_WRONG_INPUT = 2
 NO_MEMORY = "out of memory; fewer robots (--num-envs) need less"
 LACKS_MEMORY = re.compile(r"(?i)out of memory|can't allocate memory|failed to allocate|bad_?alloc|unable to allocate")
 """Pattern that matches messages of torch, Warp, NumPy and C++ about a lack of memory."""
+OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
+"""Pattern of options that exist in legged_gym too. They may be written with underscores, as in legged_gym."""
 SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
 """Signals from Ctrl-C, from a scheduler, and from a terminal that is closed."""
 
@@ -97,8 +99,10 @@ class SubCommand:
 
     def parse(self, argv: list[str] | None) -> argparse.Namespace:
         """Parse the command line `argv`, or the arguments of this process if `argv` is None. Return the parsed arguments."""
-        args = self.build_parser().parse_intermixed_args(argv)
-        args.words = sys.argv[1:] if argv is None else argv
+        words = sys.argv[1:] if argv is None else argv
+        hyphened = [OF_LEGGED_GYM.sub(lambda option: option[0].replace("_", "-"), word) for word in words]
+        args = self.build_parser().parse_intermixed_args(hyphened)
+        args.words = words
         args.start_s = STARTED_S if argv is None else time.perf_counter()
         return args  # type: ignore[no-any-return]
 

@@ -9,8 +9,8 @@ import torch
 
 from legged.config import TaskConfig, override
 from legged.config.networks import groups_in
-from legged.config.schema import DrawConfig, LeggedDomainRandConfig
-from legged.envs import BaseTask, RobotTask
+from legged.config.schema import DrawConfig, RobotDomainRandConfig
+from legged.envs import BaseTask, is_robot_task
 from legged.mdp.control import action_scales
 from legged.mdp.distributions import standard_deviation
 from legged.physics import FIELDS
@@ -56,7 +56,7 @@ _number = "{:.6g}".format
 
 def _robot(task: BaseTask) -> Iterator[str]:
     """Yield the size of a legged robot, and the factors by which settings written for another robot are rescaled."""
-    if not isinstance(task, RobotTask):
+    if not is_robot_task(task):
         return
     size = Size(task.robot.mass, task.robot.height)
     line = f"robot: {task.robot.name}, {size.mass:.4g} kg, {size.height:.3g} m high"
@@ -112,7 +112,7 @@ def _randomisation(task: BaseTask) -> Iterator[str]:
     rand, draws = task.cfg.domain_rand, task.randomization.draws
     drawn = {name: (draw, task.randomization.is_each(name)) for name, draw in draws.items()}
     pushes: list[tuple[str, str, str]] = []
-    if isinstance(rand, LeggedDomainRandConfig):
+    if isinstance(rand, RobotDomainRandConfig):
         mass = ("added_base_mass", rand.randomize_base_mass, rand.added_mass_range)
         for name, on, span in (mass, ("friction", rand.randomize_friction, rand.friction_range)):
             if on and name not in draws:
@@ -140,7 +140,7 @@ def _grown(grow: tuple[float, float]) -> str:
     return f", grows over iterations {grow[0]:g} to {grow[1]:g}" if grow[1] else ""
 
 
-def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
+def _pushes(rand: RobotDomainRandConfig) -> Iterator[tuple[str, str, str]]:
     """Yield for each disturbance its name, its size, and when it acts."""
     if rand.push_robots:
         size = f"sets the base's horizontal velocity, x and y +-{_number(rand.max_push_vel_xy)} m/s"
@@ -158,7 +158,7 @@ def _pushes(rand: LeggedDomainRandConfig) -> Iterator[tuple[str, str, str]]:
 def _actions(task: BaseTask) -> Iterator[str]:
     model, clip = task.physics.model, task.cfg.control.clip_actions
     rows = [("action", "actuator", "what it does")]
-    acted = list(task.control.acted) if isinstance(task, RobotTask) else list(range(task.num_actions))
+    acted = list(task.control.acted) if is_robot_task(task) else list(range(task.num_actions))
     for i in range(model.nu):
         rows.append((str(acted.index(i)) if i in acted else "-", model.actuator(i).name or f"({i})", _effect(task, i)))
     yield from _table(f"actions: {task.num_actions} numbers, clipped at +-{clip:g}", *rows)
@@ -175,7 +175,7 @@ def _effect(task: BaseTask, i: int) -> str:
         return f"control {float(task.control_middle[i]):g} + {float(task.control_reach[i]):g} a"
     number = int(model.actuator_trnid[i, 0])
     joint = model.joint(number).name or f"({number})"
-    if not isinstance(task, RobotTask):
+    if not is_robot_task(task):
         force = float(model.actuator_gear[i, 0] * model.actuator_gainprm[i, 0])
         middle = float(task.control_middle[i]) * force
         slides = model.jnt_type[number] == mujoco.mjtJoint.mjJNT_SLIDE

@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from legged.config.checks import DEEPEST, SHOWN, build, hints_of, plain_path, shown
 from legged.config.legged import LeggedConfig
@@ -31,6 +31,7 @@ class Registered:
     """Folder of the user-defined code. Paths in a mapping are relative to this folder."""
 
 
+Schema = TypeVar("Schema", bound=TaskConfig)
 Source = Path | Mapping[str, Any] | Registered
 Rescale = Callable[[Mapping[str, Any], str, str, str], Mapping[str, Any]]
 """Function: (settings, the robot for which they were written, the task's robot, prefix of error messages) -> settings for the
@@ -349,12 +350,12 @@ def from_dict(
     return cfg
 
 
-def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
+def override(cfg: Schema, overrides: Iterable[tuple[str, Any]]) -> Schema:
     """Return a copy of `cfg` with some settings replaced and checked. `overrides` are pairs of a dotted path and a value."""
     data = to_dict(cfg)
     origins = Origins(cfg.origins)
     _merge_overrides(data, overrides, origins, type(cfg))
-    return from_dict(data, origins, source=cfg.task, schema=type(cfg))
+    return from_dict(data, origins, source=cfg.task, schema=type(cfg))  # type: ignore[return-value]
 
 
 def to_dict(config: Any) -> Any:

@@ -54,7 +54,9 @@ class DomainRandConfig(Section):
 class RewardsConfig(Section):
     """Scales of the `_reward_<name>` terms."""
 
-    scales: dict[str, float] = field(default_factory=dict, metadata=between(-LARGEST, LARGEST))
+    scales: dict[str, float] = field(
+        default_factory=dict, metadata=rescaled_by_term("_reward_", -1, between(-LARGEST, LARGEST))
+    )
     """Term -> scale. A scale of 0 switches the term off."""
     times_dt: bool = True
     """Multiply scales by the control step, so that sums of rewards over time do not depend on the control step."""

@@ -1,7 +1,7 @@
 """Configuration of any kind of task. If a task class has more sections, its `Config` is a subclass of TaskConfig."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from legged.config.bounds import NAME
 from legged.config.learning import TrainConfig
@@ -17,6 +17,9 @@ OF_FORKS = ("asset", "normalization", "noise")
 @dataclass(frozen=True)
 class TaskConfig(Section):
     """Configuration of a task: its world, its Markov decision process, and the training of its policy."""
+
+    DISTURBANCES: ClassVar[tuple[str, ...]] = ("observations.add_noise",)
+    """Dotted paths of the switches that measurements of a policy set to false."""
 
     task: str = field(default="", metadata=NAME)
     """Name of the task, set by the registry."""

@@ -13,7 +13,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 
+from legged.deploy.command_parser import CommandParser, argument, check_between
+from legged.deploy.errors import ConfigError, RunError, suggest
 from legged.deploy.interface import Interface
+from legged.deploy.log import check_folder
 from legged.deploy.operators import DEVICE, HELP, Event, Gamepad, Keyboard, Operator, Orders, Script
 from legged.deploy.pace import StatusMessages, take_priority
 from legged.deploy.policy import Policy
@@ -21,9 +24,6 @@ from legged.deploy.program import Program
 from legged.deploy.safety import Limits
 from legged.deploy.udp import UdpRobot
 from legged.deploy.unitree import KINDS, SdkWire, UnitreeRobot
-from legged.errors import ConfigError, RunError, suggest
-from legged.process.command_parser import CommandParser, argument, check_between
-from legged.process.paths import ready_to_write
 
 ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
 """Signals at which the program brakes the robot and then ends. They come from Ctrl-C, `kill`, a closed terminal, Ctrl-\\ and
@@ -93,7 +93,7 @@ def _main(argv: list[str] | None) -> int:
         fits = False
     if not fits:
         raise ConfigError(f"--log: must be the name of an .npz file, got '{args.log}'")
-    ready_to_write(args.log.parent)
+    check_folder(args.log.parent)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a wrong policy before UnitreeRobot ends the robot's own controller
         policy.contract.check_fits(KINDS[args.robot].facts)

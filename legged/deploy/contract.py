@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from legged.deploy.errors import ConfigError
 from legged.deploy.interface import RobotFacts
-from legged.errors import ConfigError
 
 CONTRACT_VERSION = 1
 """Version of policy.json that this package writes and reads."""

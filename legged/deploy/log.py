@@ -1,17 +1,19 @@
 """Log of a run: readings with joint targets and gains, cycles of the program, and samples for fitting actuators."""
 
 import json
+import tempfile
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from legged.deploy.contract import Contract
+from legged.deploy.errors import ConfigError, RunError
 from legged.deploy.interface import Reading
 from legged.deploy.operators import State
-from legged.process.paths import make_folder, replacing
 
 STATES = tuple(state.value for state in State)
 ACTUATORS = "_actuators"
@@ -93,14 +95,43 @@ class Log:
             "note_times": np.array([seconds for seconds, _ in self._notes]),
             "contract": np.array(json.dumps(self._contract.entries)),
         }
-        make_folder(path.parent)
         beside, samples = path.with_stem(f"{path.stem}{ACTUATORS}"), actuator_arrays(arrays, self._contract)
-        with replacing(path) as part:
-            np.savez_compressed(part, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-            beside.unlink(missing_ok=True)  # an earlier run may have left this file
+        _write(path, arrays)
         if samples is not None:
-            with replacing(beside) as part:
-                np.savez_compressed(part, allow_pickle=False, **samples)  # type: ignore[arg-type]
+            _write(beside, samples)
+        else:
+            beside.unlink(missing_ok=True)  # an earlier run may have left this file
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder of the log, and check before the robot moves that a file can be written there.
+
+    Raises:
+        ConfigError: no file can be written there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder, buffering=0) as probe:
+            probe.write(bytes(2**20))
+    except OSError as error:
+        raise ConfigError(f"--log: cannot write to the folder {folder}: {error.strerror or error}") from error
+
+
+def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write an .npz file under another name, and rename it when it is complete.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    part = path.with_name(f".{path.name}")
+    try:
+        with part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise RunError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def actuator_arrays(log: Mapping[str, np.ndarray], contract: Contract) -> dict[str, np.ndarray] | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from legged.deploy.contract import Contract
-from legged.errors import ConfigError, suggest
+from legged.deploy.errors import ConfigError, suggest
 
 
 class State(Enum):

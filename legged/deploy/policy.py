@@ -8,8 +8,8 @@ import numpy as np
 import onnxruntime
 
 from legged.deploy.contract import Contract, read_contract
+from legged.deploy.errors import ConfigError
 from legged.deploy.interface import Reading
-from legged.errors import ConfigError
 
 WARM_UP = 20
 """Number of trial runs after the network is loaded. The first runs of a network take ten times as long as later runs."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from legged.deploy.contract import plain_json
+from legged.deploy.errors import ConfigError, RunError
 from legged.deploy.interface import Interface, Reading, RobotFacts
-from legged.errors import ConfigError, RunError
 
 HEADER = struct.Struct("<4sBxxxI")
 MAGIC = b"LGD1"

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from legged.deploy.errors import ConfigError, RunError
 from legged.deploy.interface import Interface, Reading, RobotFacts
-from legged.errors import ConfigError, RunError
 
 COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
 SWITCHER = "unitree_sdk2py.comm.motion_switcher.motion_switcher_client"

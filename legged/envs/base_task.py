@@ -19,7 +19,6 @@ from legged.config.schema import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
 from legged.envs.concurrent_terms import ConcurrentTerms
-from legged.envs.final_observation import StepWatcher
 from legged.envs.marks import concurrent, is_concurrent
 from legged.envs.privileged_terms import PrivilegedTerms
 from legged.errors import ConfigError
@@ -179,8 +178,8 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._stream_1, self._stream_2 = Branch(device), Branch(device)  # type: ignore[arg-type]
         self.numbers = RandomPool(n, device)  # type: ignore[arg-type]
         """Pool of the random numbers of a step. Subclasses reserve columns in `_init_buffers`."""
-        self.step_watcher: StepWatcher | None = None
-        """Watcher that copies tensors in each step, before episodes are reset; `final_observation.watch_steps` sets it."""
+        self.step_watcher: Callable[[], None] | None = None
+        """Function that copies tensors in each step, before episodes are reset; `final_observation.watch_steps` sets it."""
         self._steps_since_log = 0
         self._has_buffers = False
 
@@ -261,7 +260,8 @@ class BaseTask(PrivilegedTerms, VecEnv):
         if not measured:
             return None
         errors = (cfg.bias, cfg.delay, cfg.dropped)
-        return ObservationErrors(self.observation_terms, sorted(measured), *errors, noise, self.numbers, height_map)
+        terms = self.observation_terms
+        return ObservationErrors(terms.values, terms.columns, sorted(measured), *errors, noise, self.numbers, height_map)
 
     def _noise(self) -> dict[str, float]:
         """Return the half width of each term's noise, in the term's unit."""
@@ -315,7 +315,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._stream_1.join()
         self._stream_2.join()
         if self.step_watcher is not None:
-            self.step_watcher.take()
+            self.step_watcher()
         with self._stream_1.fork():
             self.metrics.add_episodes(self.reset_buf, self.terminated_buf, self.episode_length_buf, self.rewards.sums)
         with self._stream_2.fork():

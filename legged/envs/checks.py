@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import get_args
 
+from legged.config.legged import follows_velocities
 from legged.config.networks import check_networks, learns_from_teacher
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.schema import TaskConfig
 from legged.envs.class_checks import check_overrides, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
@@ -62,7 +63,7 @@ def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
     """Return the names of the figures that evaluations during training report for a task of class `cls`: the standard
     figures, then the task's metrics. The first one decides which policy is best, unless train.runner.best_by names another.
     """
-    first = FOLLOWING if isinstance(cfg, LeggedConfig) else RETURNING
+    first = FOLLOWING if follows_velocities(cfg) else RETURNING
     return *first, *sorted(cls.terms("_metric_") - {*first})  # type: ignore[attr-defined]
 
 

@@ -1,28 +1,12 @@
 """Final observations of episodes. Watchers copy tensors at the end of each step, before episodes are reset."""
 
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from collections.abc import Callable
 
 import torch
 
+from legged.envs.base_task import BaseTask
 from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.physics import Physics
-
-if TYPE_CHECKING:
-    from legged.envs.base_task import BaseTask
-
-
-class StepWatcher(Protocol):
-    """Watcher of a task. Each step calls `take` after rewards are computed and before any environment is reset, pushed or
-    given a new command.
-    """
-
-    def take(self) -> None:
-        """Copy tensors of the task. A CUDA graph captures this method with the step, so the host must not read tensors, and
-        buffers must keep their addresses.
-        """
-
-
-Watcher = TypeVar("Watcher", bound=StepWatcher)
 
 
 class FinalStep:
@@ -47,18 +31,20 @@ class FinalStep:
         self.qvel.copy_(self._physics.qvel)
 
 
-def keep_final_step(task: "BaseTask", graph: bool = True) -> FinalStep:
-    """Attach a `FinalStep` to a task and return it. `watch_steps` describes the arguments and errors."""
-    return watch_steps(task, FinalStep(task.observation_terms, task.observation_groups, task.physics), graph)
+def keep_final_step(task: BaseTask, graph: bool = True) -> FinalStep:
+    """Let a task keep the final step of its episodes. `watch_steps` describes the argument `graph` and the errors."""
+    kept = FinalStep(task.observation_terms, task.observation_groups, task.physics)
+    watch_steps(task, kept.take, graph)
+    return kept
 
 
-def watch_steps(task: "BaseTask", watcher: Watcher, graph: bool = True) -> Watcher:
-    """Attach `watcher` to a task and return `watcher`. From now on every step calls `watcher.take`. All episodes and
-    curricula are reset. With `graph`, the step with the watcher is captured on a GPU, or checked on the CPU.
+def watch_steps(task: BaseTask, take: Callable[[], None], graph: bool = True) -> None:
+    """Let every step of a task call `take`, after rewards are computed and before any environment is reset, pushed or given a
+    new command. All episodes and curricula are reset now. With `graph`, the step is captured on a GPU, or checked on the CPU.
+    The graph includes `take`, so the host must not read tensors in it, and its buffers must keep their addresses.
 
     Raises:
         TermError: the step cannot be captured.
     """
-    task.step_watcher = watcher
+    task.step_watcher = take
     task._build_graph(graph and (task.physics.capturable or task.physics.device.type == "cpu"))
-    return watcher

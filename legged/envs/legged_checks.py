@@ -1,11 +1,11 @@
-"""Checks of a legged robot's settings that are valid by themselves but may not fit each other or the robot."""
+"""Checks of a robot's settings that are valid by themselves but may not fit each other or the robot."""
 
 from typing import Any
 
 from legged.config.checks import shown
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import draw_of
-from legged.config.schema import LeggedConfig
+from legged.config.schema import LeggedConfig, RobotConfig
 from legged.envs.checks import check_mirror_kinds
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
@@ -21,8 +21,8 @@ MOST_POINTS = 10_000
 """Largest number of points in the height scan."""
 
 
-def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
-    """Check a legged robot's settings, except those that `check_task` checks. `cls` is the task's class.
+def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
+    """Check a robot's settings, except those that `check_task` checks. `cls` is the task's class.
 
     Raises:
         ConfigError: a setting does not fit the robot or another setting.
@@ -42,10 +42,9 @@ def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
     check_base_mass(cfg, robot)
     check_disturbances(cfg, robot)
     check_points(cfg)
-    check_grid(cfg)
 
 
-def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
+def check_symmetry(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
     """Check that robot, default pose, actions, observations and height scan have a mirror image.
 
     Raises:
@@ -88,7 +87,7 @@ def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
         raise ConfigError(f"{where}: {points} must be symmetric about 0, got {list(y)}")
 
 
-def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
+def check_mirrored_draw(cfg: RobotConfig, robot: Robot, name: str) -> None:
     """Check that an observed, randomised property has a mirror image.
 
     A property with a number for each body, shape or passive joint has no mirror image, because these parts are not paired
@@ -113,7 +112,7 @@ def check_mirrored_draw(cfg: LeggedConfig, robot: Robot, name: str) -> None:
         )
 
 
-def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
+def check_passive(cfg: RobotConfig, robot: Robot) -> None:
     """Check that passive joints are observed only if the robot has passive joints.
 
     Raises:
@@ -127,7 +126,7 @@ def check_passive(cfg: LeggedConfig, robot: Robot) -> None:
                 raise ConfigError(f"{where}: {term}: '{robot.name}' has no passive hinges or slides (passive_joints)")
 
 
-def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
+def check_base_mass(cfg: RobotConfig, robot: Robot) -> None:
     """Check that the lightest base that can be drawn has a positive mass.
 
     Raises:
@@ -142,7 +141,7 @@ def check_base_mass(cfg: LeggedConfig, robot: Robot) -> None:
         )
 
 
-def check_points(cfg: LeggedConfig) -> None:
+def check_points(cfg: RobotConfig) -> None:
     """Check that the height scan has at most MOST_POINTS points, so that it fits in memory.
 
     Raises:

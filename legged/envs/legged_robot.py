@@ -2,19 +2,21 @@
 robot_terms.py.
 """
 
-from typing import Any
+from typing import Any, ClassVar, TypeGuard
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config.legged import follows_velocities
+from legged.config.schema import LeggedConfig, TaskConfig
+from legged.envs.base_task import BaseTask
+from legged.envs.legged_checks import check_grid
 from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.robot_task import RobotTask
 from legged.envs.velocity_terms import VelocityTerms
-from legged.envs.views import Wide
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
-from legged.mdp.terrain_curriculum import TerrainCurriculum
 
 
 class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
@@ -23,21 +25,21 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     F feet, B tracked collision shapes.
     """
 
+    Config: ClassVar[type[TaskConfig]] = LeggedConfig
+    cfg: LeggedConfig
+
+    @classmethod
+    def check(cls, cfg: TaskConfig) -> None:
+        super().check(cfg)
+        assert follows_velocities(cfg)
+        check_grid(cfg)
+
     def _init_buffers(self) -> None:
-        """Allocate tensors and parts for the robot, its commands, its ground and the curricula."""
+        """Allocate tensors and parts for the robot, its ground, its commands and their curriculum."""
         super()._init_buffers()
         cfg, kernels = self.cfg, self.physics.kernels
-        default, last = self.default_dof_pos, self.last_actions
-        self.default_dof_pos = Wide.of(default, lambda: default.unsqueeze(0))
-        self.last_actions = Wide.of(last, lambda: torch.stack([last, self.last_last_actions], dim=2))
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
-        self.terrain_curriculum: TerrainCurriculum | None = None
-        if self.terrain is not None:
-            self.terrain_curriculum = TerrainCurriculum(
-                cfg.terrain, self.terrain, self.num_envs, self.dt, self.device, kernels
-            )
-            self.env_origins = self.terrain_curriculum.origins
 
     def make_commands(self) -> None:
         sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.physics.kernels, self.numbers)
@@ -56,11 +58,6 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         super().draw()
         self.command_sampler.draw()
 
-    def draw_reset(self) -> None:
-        if self.terrain_curriculum is not None:
-            self.terrain_curriculum.draw()
-        super().draw_reset()
-
     def update_curricula(self) -> None:
         self.command_curriculum.update(self.commands[:, :3], self.base_lin_vel, self.base_ang_vel, self.valid)
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
@@ -68,11 +65,6 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
             steps_left = self.max_episode_length - self.episode_length_buf
             step = (self.commands, self.base_lin_vel, steps_left)
             self.terrain_curriculum.update(self.reset_buf, self.valid, *step)
-
-    def reset(self) -> TensorDict:
-        if self.terrain_curriculum is not None:
-            self.terrain_curriculum.begin()
-        return super().reset()
 
     def ask(self) -> None:
         """Give robots their next commands when these are due, and steer towards headings."""
@@ -93,10 +85,9 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     # ---- curricula and saved state -----------------------------------------------------------------------------------
 
     def reset_curricula(self) -> None:
+        super().reset_curricula()
         self.command_curriculum.reset()
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
-        if self.terrain_curriculum is not None:
-            self.terrain_curriculum.reset()
 
     def log_rollout(self) -> dict[str, Tensor]:
         ranges = {f"Metrics/{name}": value for name, value in self.command_curriculum.metrics().items()}
@@ -104,20 +95,17 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         return {**super().log_rollout(), **ranges, **levels}
 
     def progress(self) -> dict[str, Any]:
-        progress = super().progress() | {"command_curriculum": self.command_curriculum.progress()}
-        if self.terrain_curriculum is not None:
-            progress["terrain_curriculum"] = self.terrain_curriculum.progress()
-        return progress
+        return super().progress() | {"command_curriculum": self.command_curriculum.progress()}
 
     def load_progress(self, progress: dict[str, Any]) -> None:
         super().load_progress(progress)
         self.command_curriculum.load_progress(progress["command_curriculum"])
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
-        if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
-            self.terrain_curriculum.load_progress(progress["terrain_curriculum"])
 
     def parts(self) -> dict[str, Any]:
-        parts = {**super().parts(), "commands": self.command_sampler, "command_curriculum": self.command_curriculum}
-        if self.terrain_curriculum is not None:
-            parts["terrain_curriculum"] = self.terrain_curriculum
-        return parts
+        return {**super().parts(), "commands": self.command_sampler, "command_curriculum": self.command_curriculum}
+
+
+def is_velocity_task(task: BaseTask) -> TypeGuard[LeggedRobot]:
+    """Return whether a task's robots follow velocity commands, so that `hold_commands` steers them."""
+    return isinstance(task, LeggedRobot)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig, ForceConfig, draw_of
-from legged.config.schema import LeggedConfig
+from legged.config.schema import RobotConfig
 from legged.envs.marks import unit
 from legged.errors import ConfigError
 from legged.mdp.mirror_images import MirrorKind
@@ -59,7 +59,7 @@ MIRROR_KINDS: dict[str, MirrorKind] = {f"{PREFIX}{name}": _mirror_kind(name, fie
 MIRROR_KINDS["push_force"] = "vectors"
 
 
-def observed_forces(cfg: LeggedConfig) -> dict[str, ForceConfig]:
+def observed_forces(cfg: RobotConfig) -> dict[str, ForceConfig]:
     """Return name -> force. Forces that are only in `domain_rand.observed_forces` do not act, and are observed as 0."""
     return {**cfg.domain_rand.observed_forces, **cfg.domain_rand.forces}
 

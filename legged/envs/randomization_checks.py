@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.robot import has_robot
+from legged.config.schema import RobotConfig, TaskConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observed_forces
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import FIELDS
@@ -18,7 +19,7 @@ def check_randomization(cfg: TaskConfig) -> None:
     Raises:
         ConfigError: a property does not exist, has an invalid entry, or does not fit the engine or the control law.
     """
-    rand, legged = cfg.domain_rand, isinstance(cfg, LeggedConfig)
+    rand, legged = cfg.domain_rand, has_robot(cfg)
     for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
         for name, entry in ranges.items():
             _check_draw(name, draw_of(entry), legged, f"domain_rand.{key}.{name}", cfg.origins.where)
@@ -28,14 +29,14 @@ def check_randomization(cfg: TaskConfig) -> None:
             if draw_of(entry).when != "start":
                 where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
                 raise ConfigError(f"{where}: {cfg.sim.solver} can't change properties after the start; set sim.solver=mujoco")
-    if isinstance(cfg, LeggedConfig) and cfg.control.laws == {"T"}:
+    if has_robot(cfg) and cfg.control.laws == {"T"}:
         for name in ("p_gain", "d_gain", "joint_offset"):
             if name in rand.ranges:
                 where = cfg.origins.where(f"domain_rand.ranges.{name}")
                 raise ConfigError(
                     f"{where}: control.control_type T takes actions as torques, and has no {FIELDS[name].meaning}"
                 )
-    actuator = cfg.control.actuator if isinstance(cfg, LeggedConfig) else None
+    actuator = cfg.control.actuator if has_robot(cfg) else None
     if actuator is not None and actuator.network and not actuator.joints:
         for name in ("p_gain", "d_gain"):
             if name in rand.ranges:
@@ -43,7 +44,7 @@ def check_randomization(cfg: TaskConfig) -> None:
                     f"{cfg.origins.where(f'domain_rand.ranges.{name}')}: all joints have a learned actuator"
                     " (control.actuator.network), which has no gains to draw"
                 )
-    if isinstance(cfg, LeggedConfig) and "P" not in cfg.control.laws and "joint_offset" in rand.ranges:
+    if has_robot(cfg) and "P" not in cfg.control.laws and "joint_offset" in rand.ranges:
         where = cfg.origins.where("domain_rand.ranges.joint_offset")
         raise ConfigError(f"{where}: control.control_type V does not read joint angles, so an offset has no effect")
 
@@ -106,7 +107,7 @@ def _check_derived(cfg: TaskConfig) -> None:
         if FIELDS[name].derived:
             draw = draw_of(entry)
             moments[name] = draw.when, draw.interval_s
-    if isinstance(cfg, LeggedConfig) and cfg.domain_rand.randomize_base_mass:
+    if has_robot(cfg) and cfg.domain_rand.randomize_base_mass:
         moments.setdefault("added_base_mass", ("start", 0.0))
     for name, moment in moments.items():
         first = next(iter(moments))
@@ -120,7 +121,7 @@ def _check_derived(cfg: TaskConfig) -> None:
             raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
 
 
-def check_disturbances(cfg: LeggedConfig, robot: Robot) -> None:
+def check_disturbances(cfg: RobotConfig, robot: Robot) -> None:
     """Check kicks and forces.
 
     Raises:
@@ -167,9 +168,9 @@ def check_observed(cfg: TaskConfig) -> None:
                         f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not symmetric about 0, so"
                         " the term has no mirror image; set a symmetric range or train.algorithm.symmetry=false"
                     )
-            if term == "push_force" and isinstance(cfg, LeggedConfig) and not observed_forces(cfg):
+            if term == "push_force" and has_robot(cfg) and not observed_forces(cfg):
                 raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
-            if term == "push_force" and isinstance(cfg, LeggedConfig) and cfg.train.algorithm.symmetry:
+            if term == "push_force" and has_robot(cfg) and cfg.train.algorithm.symmetry:
                 aside = [force.body for force in observed_forces(cfg).values() if force.body]
                 if aside:
                     raise ConfigError(

@@ -1,16 +1,16 @@
-"""Task of a robot on its ground: control, contacts, height scan, randomisation, pushes and initial states. A subclass adds
-commands. Terms of every robot task are in robot_terms.py.
+"""Task of a robot on its ground: control, contacts, height scan, tiles, randomisation, pushes and initial states. A subclass
+adds commands. Terms of every robot task are in robot_terms.py.
 """
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.robot import has_robot
+from legged.config.schema import RobotConfig, TaskConfig
 from legged.envs.base_task import BaseTask
-from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms
 from legged.math import evenly_spaced, quat_rotate
@@ -22,6 +22,7 @@ from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
+from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
@@ -35,11 +36,11 @@ class RobotTask(RobotTerms, BaseTask):
     collision shapes.
     """
 
-    Config: ClassVar[type[TaskConfig]] = LeggedConfig
-    cfg: LeggedConfig
+    Config: ClassVar[type[TaskConfig]] = RobotConfig
+    cfg: RobotConfig
 
     def __init__(
-        self, cfg: LeggedConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
+        self, cfg: RobotConfig, device: torch.device | str = "cpu", graph: bool = True, terrain: Terrain | None = None
     ) -> None:
         """Build physics and MDP on `device`. With `graph`, the step is captured in a CUDA graph if `device` is a GPU. If
         `terrain` is given, it replaces the configured one.
@@ -53,16 +54,9 @@ class RobotTask(RobotTerms, BaseTask):
 
     @classmethod
     def check(cls, cfg: TaskConfig) -> None:
-        """Check a configuration completely, before anything is built.
-
-        Raises:
-            ConfigError: the configuration is invalid for this task.
-        """
-        check_overrides(cls)  # comes first, because a wrong override can make other checks fail
-        assert isinstance(cfg, LeggedConfig)
-        robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
-        check_legged(cls, cfg, robot)
+        assert has_robot(cfg)
+        check_legged(cls, cfg, load_robot(cfg.robot, cfg.origins.where("robot")))
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
@@ -90,7 +84,7 @@ class RobotTask(RobotTerms, BaseTask):
         super()._allocate()
 
     def _init_buffers(self) -> None:
-        """Allocate tensors and parts for the robot, its commands and its ground."""
+        """Allocate tensors and parts for the robot, its ground and what the robot is asked to do."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
         kernels = self.physics.kernels
@@ -108,7 +102,6 @@ class RobotTask(RobotTerms, BaseTask):
         steps = cfg.train.runner.num_steps_per_env
         self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
-        self._vary_control()
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.make_commands()
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels, contact_force(robot.mass))
@@ -122,14 +115,19 @@ class RobotTask(RobotTerms, BaseTask):
         self.dof_vel_limits = self._nominal_vel_limits
         if "velocity_limit" in self.randomization.draws:
             self.dof_vel_limits = torch.zeros_like(self.dof_vel)
-        self._vary_velocity_limits()
+        self._vary()
         self.dof_pos_limits = self._soft_limits(robot)
         self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
         self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
+        self.terrain_curriculum: TerrainCurriculum | None = None
+        """Tiles on which episodes begin; None on a plane. Robots keep their tiles unless a subclass moves them."""
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) middle of the area in which each robot's episodes begin, world frame [m]."""
+        if self.terrain is not None:
+            self.terrain_curriculum = TerrainCurriculum(cfg.terrain, self.terrain, n, self.dt, device, kernels)
+            self.env_origins = self.terrain_curriculum.origins
         reach, height = cfg.terrain.spawn_range if self.terrain is not None else 0.0, robot.file.spawn_height
         self._spawn = self.numbers.between([-reach, -reach, height], [reach, reach, height], 3)
         low, high = (factor * self.default_dof_pos for factor in cfg.init_state.dof_pos_factor)
@@ -211,6 +209,8 @@ class RobotTask(RobotTerms, BaseTask):
         """Draw joint angles near the default pose, and velocity and yaw of the base. A robot with passive joints gets one of
         the poses that were computed at the start. In these poses its kinematic loops are closed.
         """
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.draw()
         if self._poses is None:
             self.reset_qpos[:, 7:].copy_(self._reset_joints.values)
         else:
@@ -242,33 +242,34 @@ class RobotTask(RobotTerms, BaseTask):
 
     def reset(self) -> TensorDict:
         self.disturbances.end(self.physics)
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.begin()
         return super().reset()
+
+    def reset_curricula(self) -> None:
+        if self.terrain_curriculum is not None:
+            self.terrain_curriculum.reset()
 
     def redraw(self, mask: Tensor) -> None:
         super().redraw(mask)
-        self._vary_control(again=True)
-        self._vary_velocity_limits(again=True)
+        self._vary(again=True)
 
-    def _vary_control(self, again: bool = False) -> None:
-        """Apply randomised properties to the control law; with `again`, only those with `when: reset` or `interval`."""
-        names = self.randomization.redrawn if again else self.randomization.draws
-        drawn = self.randomization.fields
-        self.control.vary({name: drawn[name] for name in names})
-
-    def _vary_velocity_limits(self, again: bool = False) -> None:
-        """Apply the randomised `velocity_limit` to `dof_vel_limits` and to the no-load speeds of motors; with `again`, only
-        if it has `when: reset` or `interval`.
+    def _vary(self, again: bool = False) -> None:
+        """Apply randomised properties to the control law, and `velocity_limit` to `dof_vel_limits` and to the no-load speeds
+        of motors; with `again`, only properties with `when: reset` or `interval`.
         """
-        if "velocity_limit" in (self.randomization.redrawn if again else self.randomization.draws):
-            factor = self.randomization.fields["velocity_limit"].view(self.num_envs, -1)
+        drawn = self.randomization.fields
+        names = self.randomization.redrawn if again else self.randomization.draws
+        self.control.vary({name: drawn[name] for name in names})
+        if "velocity_limit" in names:
+            factor = drawn["velocity_limit"].view(self.num_envs, -1)
             torch.mul(self._nominal_vel_limits, factor, out=self.dof_vel_limits)
             if self.control.actuator is not None:
                 self.control.actuator.curve.vary(factor)
 
     def apply_randomization(self) -> None:
         super().apply_randomization()
-        self._vary_control()
-        self._vary_velocity_limits()
+        self._vary()
 
     def pushed_by_forces(self) -> bool:
         return bool(self.cfg.domain_rand.forces)
@@ -288,11 +289,15 @@ class RobotTask(RobotTerms, BaseTask):
         progress = super().progress()
         if self.disturbances.STATE:
             progress["disturbances"] = self.disturbances.progress()
+        if self.terrain_curriculum is not None:
+            progress["terrain_curriculum"] = self.terrain_curriculum.progress()
         return progress
 
     def load_progress(self, progress: dict[str, Any]) -> None:
         super().load_progress(progress)
         self.disturbances.load_progress(progress.get("disturbances", {}))
+        if self.terrain_curriculum is not None and "terrain_curriculum" in progress:
+            self.terrain_curriculum.load_progress(progress["terrain_curriculum"])
 
     def parts(self) -> dict[str, Any]:
         parts = {
@@ -306,4 +311,11 @@ class RobotTask(RobotTerms, BaseTask):
             parts["disturbances"] = self.disturbances
         if self.control.actuator is not None:
             parts["actuator"] = self.control.actuator
+        if self.terrain_curriculum is not None:
+            parts["terrain_curriculum"] = self.terrain_curriculum
         return parts
+
+
+def is_robot_task(task: BaseTask) -> TypeGuard[RobotTask]:
+    """Return whether a task has a robot with joints, contacts and a ground."""
+    return isinstance(task, RobotTask)

@@ -6,6 +6,7 @@ Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If 
 import torch
 from torch import Tensor
 
+from legged.config.schema import LeggedConfig
 from legged.envs.marks import concurrent, unit
 from legged.envs.robot_terms import RobotTerms
 from legged.mdp.mirror_images import MirrorKind
@@ -18,6 +19,7 @@ class VelocityTerms(RobotTerms):
     """
 
     MIRRORED: dict[str, MirrorKind] = {**RobotTerms.MIRRORED, "commands": "command"}
+    cfg: LeggedConfig
     commands: Tensor
     """(N, 4) commanded vx, vy [m/s], yaw rate [rad/s] and heading [rad]. `is_moving` (N,) is True if any motion is
     commanded.

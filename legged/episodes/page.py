@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from legged.config import LeggedConfig, TaskConfig, override
-from legged.envs import BaseTask, LeggedRobot
+from legged.config import TaskConfig, has_robot, override
+from legged.envs import BaseTask, is_velocity_task
 from legged.episodes.ranking import Figures, listing
 from legged.episodes.stored import Episodes, joint_unit
 from legged.errors import ConfigError, RunError
@@ -109,7 +109,7 @@ class Projector:
         alone = [("env.num_envs", 1), ("sim.physics", "mujoco"), ("sim.solver", "mujoco"), ("sim.threads", 1)]
         ground = episodes.about.get("ground")
         terrain = None
-        if ground is not None and isinstance(cfg, LeggedConfig):
+        if ground is not None and has_robot(cfg):
             playground = Playground.of(cfg, ground["terrain"], ground["difficulty"])
             terrain = None if playground is None else playground.build(cfg)
         self.task: BaseTask = make_task(override(cfg.trained(), alone), "cpu", False, terrain)
@@ -153,7 +153,7 @@ class Projector:
         qpos, qvel = (torch.as_tensor(np.nan_to_num(one[name][step : step + 1])) for name in ("qpos", "qvel"))
         task.physics.write(torch.ones(1, dtype=torch.bool), qpos, qvel)
         task.physics.refresh()
-        if isinstance(task, LeggedRobot):
+        if is_velocity_task(task):
             task.commands[:, :3].copy_(torch.as_tensor(one["command"][step]))
 
     def _stick_figure(self, number: int, shown: list[int]) -> dict[str, Any]:

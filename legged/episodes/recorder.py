@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config import LeggedConfig, TaskConfig, override
+from legged.config import TaskConfig, follows_velocities, has_robot, override
 from legged.config.loader import to_dict
-from legged.envs import BaseTask, LeggedRobot, RobotTask
+from legged.envs import BaseTask, RobotTask, is_robot_task, is_velocity_task
 from legged.envs.final_observation import watch_steps
 from legged.episodes.stored import AXES, FORMAT, Episodes
 from legged.errors import ConfigError
@@ -62,17 +62,14 @@ def check_wish(policy: TrainedPolicy, wish: Wish) -> Playground | None:
     Raises:
         ConfigError: a setting does not fit the task.
     """
-    if not isinstance(policy.cfg, LeggedConfig) and wish.command is not None:
+    if wish.command is not None and not follows_velocities(policy.cfg):
         raise ConfigError(f"--command: '{policy.cfg.task}' follows no commands")
     for flag, given in (("terrain", wish.terrain), ("difficulty", wish.difficulty)):
-        if given is not None and not isinstance(policy.cfg, LeggedConfig):
-            raise ConfigError(f"--{flag}: '{policy.cfg.task}' has no terrain to choose")
         if given is not None and wish.as_trained:
             raise ConfigError(f"--{flag}: --as-trained takes the ground of the training; leave out one of the two")
     wanted = override(policy.cfg, wish.changes)
-    if not isinstance(wanted, LeggedConfig) or (wish.terrain is None and wish.difficulty is None):
-        return None
-    return Playground.of(wanted, wish.terrain, wish.difficulty)
+    chosen = wish.terrain is not None or wish.difficulty is not None
+    return Playground.of(wanted, wish.terrain, wish.difficulty) if chosen else None
 
 
 def roll_out(
@@ -112,7 +109,7 @@ def roll_out(
     return replace(episodes, about=about), task.cfg
 
 
-def spread(task: LeggedRobot) -> None:
+def spread(task: RobotTask) -> None:
     """Distribute robots evenly over the tiles of all levels and types. The level of robot i follows from the fractional part
     of i times the golden ratio, so that consecutive robots have levels that are far apart.
     """
@@ -129,20 +126,17 @@ def _changes(policy: TrainedPolicy, wish: Wish, playground: Playground | None) -
     if wish.as_trained:
         drawn = to_dict(cfg.domain_rand)
         own += [(f"domain_rand.{name}", drawn[name]) for name in ("ranges", "kicks", "forces") if drawn.get(name)]
-    elif isinstance(cfg, LeggedConfig):
-        # The override of the episode length is left out, so that episodes are as long as in the training.
-        own += [change for change in undisturbed(wish.robots, 0.0) if change[0] != "env.episode_length_s"]
-        if playground is not None:
-            own += [*SETTING, *playground.changes(cfg)]
     else:
-        own.append(("observations.add_noise", False))
+        own += undisturbed(cfg, wish.robots)
+    if playground is not None and has_robot(cfg):
+        own += [*SETTING, *playground.changes(cfg)]
     return [*own, *wish.changes, ("env.num_envs", wish.robots)]
 
 
 def _about(task: BaseTask) -> dict[str, Any]:
     """Return the part of the recording's description that depends on the task only."""
     legs: dict[str, Any] = {}
-    if isinstance(task, RobotTask):
+    if is_robot_task(task):
         robot = task.robot
         legs = {
             "robot": robot.name,
@@ -225,7 +219,8 @@ def record_episodes(
         TermError: the step cannot be captured.
     """
     progress = copy.deepcopy(task.progress())
-    record = watch_steps(task, StepRecord(task), graph)
+    record = StepRecord(task)
+    watch_steps(task, record.take, graph)
     task.load_progress(progress)  # watch_steps has set curricula back to their start
     if place is not None:
         place()
@@ -238,7 +233,7 @@ def record_episodes(
     flags = slice(width - record.widths[-1], width - record.widths[-1] + len(FLAGS))
     with torch.inference_mode():
         observations, overflows = task.reset(), Overflows()
-        if command is not None and isinstance(task, LeggedRobot):
+        if command is not None and is_velocity_task(task):
             observations = task.hold_commands(buffer.new_tensor(command))
         torch.cat([record.row, physics.qpos, physics.qvel], dim=1, out=buffer[0])
         chunks, finished = [np.array(buffer[:1].cpu())], np.zeros(n, dtype=int)
@@ -305,7 +300,7 @@ def quantities_of(task: BaseTask) -> list[Quantity]:
         Quantity("action", lambda: task.actions, "1", "what the policy asked for, clipped", _actions(task)),
         Quantity("reward", lambda: task.rew_buf, "1", "sum of the parts; a negative sum may have been set to 0"),
         Quantity("reward_parts", lambda: rewards.last.t(), "1", "scale times term of this step", rewards.names),
-        *(_of_legs(task) if isinstance(task, LeggedRobot) else _of_motors(task)),
+        *(_of_robot(task) if is_robot_task(task) else _of_motors(task)),
         Quantity("ended", ended, "1", "failed, out of time, and by which terms", (*FLAGS, *terms.names)),
     ]
 
@@ -319,7 +314,7 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
     torque [N m], or force [N] of a slide, in either direction. A limit is None if the joint does not have it.
     """
     model = task.physics.model
-    if isinstance(task, RobotTask):
+    if is_robot_task(task):
         robot, turning = task.robot, [True] * len(task.robot.joint_names)
         names, positions, velocities = robot.joint_names, robot.qpos_columns, robot.qvel_columns
         ranges, fastest = np.asarray(robot.dof_pos_limits), robot.dof_vel_limits
@@ -348,11 +343,12 @@ def joints_of(task: BaseTask) -> list[dict[str, Any]]:
     ]
 
 
-def _of_legs(task: LeggedRobot) -> list[Quantity]:
-    """Return the quantities that are recorded only for legged robots."""
+def _of_robot(task: RobotTask) -> list[Quantity]:
+    """Return the quantities that are recorded only for tasks with a robot."""
     joints, feet, shapes = task.robot.joint_names, task.robot.feet_names, task.robot.contact_names
-    columns, velocity = task.feet_indices, "m/s, m/s, rad/s"
-    commanded = "velocity that was asked for in this step, base frame"
+    columns, names, unit = task.feet_indices, ("vx", "vy", "yaw"), "m/s, m/s, rad/s"
+    what = "velocity that was asked for in this step, base frame"
+    asked = [Quantity("command", lambda: task.commands[:, :3], unit, what, names)] if is_velocity_task(task) else []
     force = "contact forces on the feet at the last physics step, world frame, by x, y, z"
     sizes = "size of the contact force on every tracked shape"
     return [
@@ -362,7 +358,7 @@ def _of_legs(task: LeggedRobot) -> list[Quantity]:
         Quantity("joint_pos", lambda: task.dof_pos, "rad", "angles of the joints with a motor", joints),
         Quantity("joint_vel", lambda: task.dof_vel, "rad/s", "velocities of the joints with a motor", joints),
         Quantity("torque", lambda: task.torques, "N m", "torques of the last physics step", joints),
-        Quantity("command", lambda: task.commands[:, :3], velocity, commanded, ("vx", "vy", "yaw")),
+        *asked,
         Quantity("feet_pos", lambda: task.feet_pos, "m", "centres of the feet, world frame, by x, y, z", feet),
         Quantity("feet_force", lambda: task.contact_forces.index_select(1, columns), "N", force, feet),
         Quantity("feet_contact", lambda: task.contacts.in_contact, "1", "1 in contact, now or in the previous step", feet),
@@ -412,7 +408,7 @@ def _control_ranges(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _actions(task: BaseTask) -> tuple[str, ...]:
-    if isinstance(task, RobotTask):
+    if is_robot_task(task):
         return tuple(task.robot.joint_names[i] for i in task.control.acted)
     model = task.physics.model
     return tuple(model.actuator(i).name or f"actuator {i}" for i in range(model.nu))

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged.config import LeggedConfig, TaskConfig
+from legged.config import LeggedConfig, follows_velocities
 from legged.envs import BaseTask
 from legged.envs.actions import ordinary_tensors
 from legged.envs.checks import evaluated_figures
@@ -20,7 +20,7 @@ from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 from legged.physics import resolve_physics
 from legged.policies.actor import Actor
 from legged.policies.episodes import unit_of
-from legged.policies.restore import nominal
+from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task, task_class
 
 HOLD_S = 3.0
@@ -68,14 +68,14 @@ class TrainingEvaluation:
         cfg, device = training.cfg, torch.device(training.device)
         self.figures: tuple[str, ...] = evaluated_figures(task_class(cfg.task), cfg)
         """Names of the figures, the most important first."""
-        self._grid = few_commands(cfg) if isinstance(cfg, LeggedConfig) else None
+        self._grid = few_commands(cfg) if follows_velocities(cfg) else None
         engine = resolve_physics(cfg.sim.physics, device, num_envs=cfg.env.num_envs)
         asked: list[tuple[str, Any]] = [("sim.physics", "mujoco" if training.physics.why_c_engine else engine)]
         terrain = None
         if self._grid is not None:
             asked, terrain = place_to_track(cfg, self._grid, asked)  # type: ignore[arg-type]
         else:
-            asked += [("env.num_envs", cfg.train.runner.evaluate_envs), ("observations.add_noise", False)]
+            asked += undisturbed(cfg, cfg.train.runner.evaluate_envs)
             asked += [("env.episode_length_s", cfg.train.runner.evaluate_s)] if cfg.train.runner.evaluate_s else []
         with kept_generators(device):
             self.task: Any = make_task(nominal(cfg, asked), device, False, terrain)
@@ -164,13 +164,3 @@ class TrainingEvaluation:
             for name, errors in (("lin_vel_rmse", self._lin), ("ang_vel_rmse", self._ang)):
                 found[name] = (errors.view(-1, self._grid.robots).mean(dim=1) / measured).sqrt().mean()
         return {name: found[name] if name in found else own[name] for name in self.figures}
-
-
-def check_commands(cfg: TaskConfig) -> None:
-    """If evaluations during training are enabled, check that the configuration gives a grid of commands for them.
-
-    Raises:
-        ConfigError: an axis is not a range.
-    """
-    if cfg.train.runner.evaluate_interval and isinstance(cfg, LeggedConfig):
-        few_commands(cfg)

@@ -37,9 +37,10 @@ def evaluate_episodes(setting: Setting, episodes: int) -> int:
         RunError: the file can't be written.
     """
     start = time.perf_counter()
-    calm, changes = for_episodes(setting.policy, episodes)
     head = {**setting.head, **setting.changes}
-    task, act = restore(calm, [*changes, *setting.asked], setting.device, setting.graph)
+    task, act = restore(
+        setting.policy, [*for_episodes(setting.policy.cfg, episodes), *setting.asked], setting.device, setting.graph
+    )
     measured = measure_episodes(task, act)
     _report({**head, "wall_s": time.perf_counter() - start, "episodes": measured}, setting.folder)
     warn_of_overflows("episodes", measured["contact_overflows"])
@@ -63,8 +64,7 @@ def evaluate_in_gymnasium(setting: Setting, episodes: int) -> int:
     if not isinstance(name, str):
         asked = setting.policy.cfg.task
         raise ConfigError(f"POLICY: '{asked}' is not a task of Gymnasium: {kind.__name__} has no GYMNASIUM_ID")
-    calm, changes = for_episodes(setting.policy, 1)
-    task, act = restore(calm, [*changes, *setting.asked], setting.device, graph=False)
+    task, act = restore(setting.policy, [*for_episodes(setting.policy.cfg, 1), *setting.asked], setting.device, graph=False)
     export(task, act.network, exported, trained=setting.policy.cfg)
     measured = run_exported(exported, name, episodes)
     head = {**setting.head, "physics": GYMNASIUM, **setting.changes, "environment": name}

@@ -174,7 +174,7 @@ def trained_to(cfg: LeggedConfig) -> dict[str, float]:
 def to_run_out(cfg: LeggedConfig, num_envs: int) -> list[tuple[str, Any]]:
     """Return overrides for a task in which robots walk out of their tiles and keep their initial heading."""
     return [
-        *undisturbed(num_envs, TIME_S),
+        *undisturbed(cfg, num_envs, TIME_S),
         *on_terrain(cfg, TILE * cfg.terrain.scale, SPAWN_RANGE * cfg.terrain.scale),
         ("observations.add_noise", cfg.observations.add_noise),
         ("observations.height_map.lost", 0.0),

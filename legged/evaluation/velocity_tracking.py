@@ -58,11 +58,11 @@ def place_to_track(
     """Return the overrides and the terrain for a task of grid.num_envs undisturbed robots. The overrides end with `asked`.
     The terrain is level ground with bumps, or None for a task on a plane.
     """
-    changes = undisturbed(grid.num_envs, grid.hold_s)
+    changes = undisturbed(cfg, grid.num_envs, grid.hold_s)
     if cfg.terrain.mesh_type == "plane":
         return [*changes, *asked], None
     changes += [*on_terrain(cfg, rough_side(grid), ROUGH_SPAWN), *asked]
-    rough: Any = override(cfg, changes)
+    rough = override(cfg, changes)
     return changes, rough_ground(rough.terrain, rough.env.seed)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged.config import LeggedConfig, TaskConfig
+from legged.config import TaskConfig, has_robot
 from legged.config.networks import NETWORKS, groups_in, groups_of
 from legged.envs import BaseTask
 from legged.errors import ConfigError
@@ -341,7 +341,7 @@ def check_joints(name: str, made_for: Mapping[str, Any], cfg: TaskConfig) -> Non
         ConfigError: the joints of the two robots differ in name or order.
     """
     joints = made_for.get("joints")
-    if joints is None or not isinstance(cfg, LeggedConfig):
+    if joints is None or not has_robot(cfg):
         return
     robot = load_robot(cfg.robot, cfg.origins.where("robot"))
     if list(robot.joint_names) != joints:

@@ -249,7 +249,9 @@ class DevicePPO(CriticWarmup):
         self._losses.zero_()
         epochs = epochs or self.num_learning_epochs
         if self._fused is not None:
-            self._fused.learn(epochs, self._critic_alone, self._losses)
+            self._fused.learn(
+                self._order(self._fused.samples * self.num_mini_batches), epochs, self._critic_alone, self._losses
+            )
         else:
             batches = self._mini_batches()
             for _ in range(epochs):

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from legged.config import LeggedConfig, TaskConfig, override, to_dict
+from legged.config import TaskConfig, has_robot, override, to_dict
 from legged.config.dotted import value_at
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, check_optimizer, digests, read_checkpoint
@@ -38,7 +38,7 @@ def resumed(
     if before.task != task:
         raise ConfigError(f"--load-run: {relative(folder)} was trained on '{before.task}', not on '{task}'")
     cfg = override(before, asked)
-    if isinstance(cfg, LeggedConfig) and isinstance(before, LeggedConfig) and cfg.robot != before.robot:
+    if has_robot(cfg) and has_robot(before) and cfg.robot != before.robot:
         raise ConfigError(
             f"{cfg.origins.where('robot')}: a resumed training keeps its robot '{before.robot}'; got '{cfg.robot}'"
         )

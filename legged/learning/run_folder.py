@@ -11,10 +11,9 @@ from datetime import datetime
 from importlib import metadata
 from pathlib import Path
 
-from legged.config import TaskConfig, from_dict, to_yaml
+from legged.config import TaskConfig, from_dict, has_robot, to_yaml
 from legged.config.actuator import MOTORS
 from legged.config.checks import shown
-from legged.config.legged import LeggedConfig
 from legged.config.loader import actuator_path, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.learning.invocation import INVOCATION_FILE
@@ -60,7 +59,7 @@ def create_run(cfg: TaskConfig) -> Path:
             folder = parent / f"{stamped(cfg)}-{number}"
         except (OSError, ValueError) as error:
             raise not_made(folder, error) from error
-    if isinstance(cfg, LeggedConfig) and cfg.control.actuator.network:  # the run keeps a copy of the network's file
+    if has_robot(cfg) and cfg.control.actuator.network:  # the run keeps a copy of the network's file
         write_bytes(folder / MOTORS, Path(cfg.control.actuator.network).read_bytes())
         cfg = replace(cfg, control=replace(cfg.control, actuator=replace(cfg.control.actuator, network=MOTORS)))
     write_text(folder / CONFIG_FILE, to_yaml(cfg))

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from legged.config import LeggedConfig, TaskConfig
+from legged.config import TaskConfig, follows_velocities, has_robot
 from legged.config.networks import groups_of
 from legged.config.schema import ObservationGroupConfig, PolicyConfig
 from legged.envs.privileged_terms import PREFIX as DRAWN
@@ -110,7 +110,7 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
             pairs[f"domain_rand.observed_ranges.{drawn}"] = (_observed_as(here, drawn), _observed_as(there, drawn))
     if "push_force" in terms:
         pairs["domain_rand.forces"] = (_largest_forces(here), _largest_forces(there))
-    if "heights" in terms and isinstance(here, LeggedConfig) and isinstance(there, LeggedConfig):
+    if "heights" in terms and has_robot(here) and has_robot(there):
         for name in ("measured_points_x", "measured_points_y", "scan"):
             pairs[f"terrain.{name}"] = (getattr(here.terrain, name), getattr(there.terrain, name))
         for name in ("heights_offset", "heights_limit", "depth_limit"):
@@ -129,7 +129,7 @@ def _observed_as(cfg: TaskConfig, name: str) -> str:
 
 def _largest_forces(cfg: TaskConfig) -> str:
     """Return as text the largest value of each observed force. A force is observed as a share of this value."""
-    forces = observed_forces(cfg) if isinstance(cfg, LeggedConfig) else {}
+    forces = observed_forces(cfg) if has_robot(cfg) else {}
     return ", ".join(f"{name} up to {largest_of(force):g} N" for name, force in forces.items()) or "none"
 
 
@@ -143,7 +143,7 @@ def _shown(value: Any) -> str:
 def scale_of(cfg: TaskConfig, term: str) -> float | tuple[float, float]:
     """Return the factor of an observation term. Commands have the factors of linear and angular velocity by default."""
     scales = cfg.observations.scales
-    if term == "commands" and term not in scales and isinstance(cfg, LeggedConfig):
+    if term == "commands" and term not in scales and follows_velocities(cfg):
         return scales.get("base_lin_vel", 1.0), scales.get("base_ang_vel", 1.0)
     return scales.get(term, 1.0)
 

@@ -5,7 +5,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from legged.config import LeggedConfig, TaskConfig
+from legged.config import TaskConfig, has_robot
 from legged.config.networks import groups_of, learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError
@@ -108,7 +108,7 @@ def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
     if "joints" in said or saved["infos"].get("format", 1) > 1:
         return said
     of_run = run_config(path.parent)
-    if not isinstance(of_run, LeggedConfig):
+    if not has_robot(of_run):
         return {}
     robot = load_robot(of_run.robot, of_run.origins.where("robot"))
     return {"name": robot.name, "joints": list(robot.joint_names)}

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from legged.config.origins import Origins
-from legged.config.schema import ActuatorConfig, LeggedControlConfig
+from legged.config.schema import ActuatorConfig, RobotControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
@@ -100,7 +100,7 @@ class Actuator:
     def __init__(
         self,
         robot: Robot,
-        cfg: LeggedControlConfig,
+        cfg: RobotControlConfig,
         middle: Tensor,
         shape: tuple[int, int],
         sim_dt: float,
@@ -319,7 +319,7 @@ def by_joint(table: Mapping[str, float], robot: Robot, where: str, otherwise: np
     return np.array([otherwise[i] if p is None else table[p] for i, p in enumerate(found)], dtype=float)
 
 
-def check_actuator(robot: Robot, cfg: LeggedControlConfig, sim_dt: float, where: Callable[[str], str] = str) -> None:
+def check_actuator(robot: Robot, cfg: RobotControlConfig, sim_dt: float, where: Callable[[str], str] = str) -> None:
     """Check that the actuators fit the robot, its control law and the physics step `sim_dt` [s]. `where` turns a dotted path
     into the beginning of an error message.
 
@@ -360,7 +360,7 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
 
 
 def check_slowest(
-    robot: Robot, cfg: LeggedControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
+    robot: Robot, cfg: RobotControlConfig, sim_dt: float, lowest: float, where: Callable[[str], str] = str
 ) -> None:
     """Check that no torque-speed line is too steep for the physics step if randomisation multiplies no-load speeds by
     `lowest`. `where` turns a dotted path into the beginning of an error message.

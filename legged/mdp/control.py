@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.schema import LeggedControlConfig
+from legged.config.schema import RobotControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator import Actuator, is_ideal
@@ -35,7 +35,7 @@ class Control:
     def __init__(
         self,
         robot: Robot,
-        cfg: LeggedControlConfig,
+        cfg: RobotControlConfig,
         torques: Tensor,
         sim_dt: float,
         kernels: "TaskKernels | None" = None,
@@ -180,7 +180,7 @@ class Control:
             self.actuator.reset(mask, self._middle())
 
 
-def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> None:
+def check_wheels(robot: Robot, cfg: RobotControlConfig, where: Callable[[str], str] = str) -> None:
     """Check that all wheels with the law P are held, because P would turn them to an angle. `where` turns a dotted path into
     the beginning of an error message.
 
@@ -196,7 +196,7 @@ def check_wheels(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], 
             )
 
 
-def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
+def control_gains(robot: Robot, cfg: RobotControlConfig, where: Callable[[str], str] = str) -> tuple[np.ndarray, np.ndarray]:
     """Return stiffness and damping of a task, (D,) each: from the tables in `cfg` if it has any, else from the robot. `where`
     turns a dotted path into the beginning of an error message.
 
@@ -210,7 +210,7 @@ def control_gains(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str],
     return gains("stiffness", cfg.stiffness, robot.stiffness), gains("damping", cfg.damping, robot.damping)
 
 
-def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
+def acted_joints(robot: Robot, cfg: RobotControlConfig, where: Callable[[str], str] = str) -> tuple[int, ...]:
     """Return the indices of the joints that have an action, (A,): all joints that are not held. `where` turns a dotted path
     into the beginning of an error message.
 
@@ -228,7 +228,7 @@ def acted_joints(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], 
     return tuple(i for i in range(robot.num_dof) if i not in held)
 
 
-def action_scales(robot: Robot, cfg: LeggedControlConfig, where: Callable[[str], str] = str) -> np.ndarray:
+def action_scales(robot: Robot, cfg: RobotControlConfig, where: Callable[[str], str] = str) -> np.ndarray:
     """Return the scale of each action, (A,). `where` turns a dotted path into the beginning of an error message.
 
     Raises:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from legged.config.schema import DrawConfig, ForceConfig, KickConfig, LeggedDomainRandConfig
+from legged.config.schema import DrawConfig, ForceConfig, KickConfig, RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool
@@ -97,7 +97,7 @@ class Disturbances:
 
     def __init__(
         self,
-        cfg: LeggedDomainRandConfig,
+        cfg: RobotDomainRandConfig,
         physics: Physics,
         dt: float,
         steps_per_iteration: int,

@@ -4,7 +4,6 @@ Errors are applied to terms once per control step, so that all observation group
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,9 +11,6 @@ from torch import Tensor
 from legged.math import masked_set_
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.random_pool import RandomPool
-
-if TYPE_CHECKING:
-    from legged.mdp.observations import ObservationTerms
 
 HEIGHTS = "heights"
 """Name of the term that is read from the height map."""
@@ -30,7 +26,8 @@ class ObservationErrors:
 
     def __init__(
         self,
-        source: "ObservationTerms",
+        source: Tensor,
+        columns: Mapping[str, slice],
         names: Sequence[str],
         bias: Mapping[str, float],
         delay: Mapping[str, tuple[int, int]],
@@ -39,26 +36,27 @@ class ObservationErrors:
         numbers: RandomPool,
         height_map: HeightMapErrors | None = None,
     ) -> None:
-        """Apply errors to the terms `names` of `source`. Each table has entries by term; a missing entry means no such error.
+        """Apply errors to the terms `names` of `source` (N, width), of which each term has its `columns`. Each table has
+        entries by term; a missing entry means no such error.
 
         `bias` and `noise` are half widths of uniform distributions, in the term's unit. `delay` is the lowest and highest
         number of control steps. `dropped` is the share of control steps at which a term is lost. Random numbers come from the
         pool `numbers`. With `height_map`, the heights are read from that map.
         """
-        self.columns, self.names = source.columns, tuple(sorted(names, key=lambda name: source.columns[name].start))
+        self.columns, self.names = columns, tuple(sorted(names, key=lambda name: columns[name].start))
         self.noise = {name: noise.get(name, 0.0) for name in self.names}
         """Term -> half width of its noise, in the term's unit."""
         self._source, self._map = source, height_map
         self._shares, self._delays = (bias, dropped), delay
-        num_envs, device = source.values.shape[0], source.values.device
-        columns = [i for name in self.names for i in range(source.columns[name].start, source.columns[name].stop)]
-        widths = [source.columns[name].stop - source.columns[name].start for name in self.names]
+        num_envs, device = source.shape[0], source.device
+        taken = [i for name in self.names for i in range(columns[name].start, columns[name].stop)]
+        widths = [columns[name].stop - columns[name].start for name in self.names]
         term_of = [i for i, width in enumerate(widths) for _ in range(width)]
-        self.values = torch.zeros_like(source.values)
+        self.values = torch.zeros_like(source)
         """(N, width) all terms, after errors were applied. Observation groups with noise read them."""
-        together = columns == list(range(columns[0], columns[0] + len(columns)))
-        self._slice = slice(columns[0], columns[0] + len(columns)) if together else None
-        self._columns = torch.tensor(columns, device=device)
+        together = taken == list(range(taken[0], taken[0] + len(taken)))
+        self._slice = slice(taken[0], taken[0] + len(taken)) if together else None
+        self._columns = torch.tensor(taken, device=device)
         self._term_of = torch.tensor(term_of, device=device)
         if height_map is not None and HEIGHTS in self.names:
             start = sum(widths[: self.names.index(HEIGHTS)])
@@ -70,22 +68,22 @@ class ObservationErrors:
             return torch.tensor([float(table.get(self.names[i], 0.0)) for i in term_of], device=device)
 
         half, width = by_column(bias), by_column(noise)
-        self._bias_drawn = numbers.between(-half, half, len(columns)) if half.any() else None
-        self.bias = torch.zeros(num_envs, len(columns) if self._bias_drawn else 0, device=device)
+        self._bias_drawn = numbers.between(-half, half, len(taken)) if half.any() else None
+        self.bias = torch.zeros(num_envs, len(taken) if self._bias_drawn else 0, device=device)
         """(N, C) bias of the C columns that have errors, constant within an episode; (N, 0) without bias."""
-        self._noise = numbers.between(-width, width, len(columns)) if width.any() else None
+        self._noise = numbers.between(-width, width, len(taken)) if width.any() else None
         low, high = (torch.tensor([delay.get(name, (0, 0))[k] for name in self.names], device=device) for k in (0, 1))
         self._longest = int(high.max())
         self._most = high
         self._delay_drawn = numbers.between(low.float(), high.float() + 1.0, len(high)) if self._longest else None
         self.delay = high.expand(num_envs, -1).clone()
         """(N, T) delay of the T terms that have errors, constant within an episode [control steps]."""
-        self.past = torch.zeros(num_envs, self._longest + 1 if self._longest else 0, len(columns), device=device)
+        self.past = torch.zeros(num_envs, self._longest + 1 if self._longest else 0, len(taken), device=device)
         """(N, steps, C) measurements of the last steps, newest first; (N, 0, C) without delay."""
         lost = torch.tensor([float(dropped.get(name, 0.0)) for name in self.names], device=device)
         self._dropped = lost if lost.any() else None
         self._lost_drawn = numbers.between(0.0, 1.0, len(lost)) if lost.any() else None
-        self.held = torch.zeros(num_envs, len(columns) if self._lost_drawn else 0, device=device)
+        self.held = torch.zeros(num_envs, len(taken) if self._lost_drawn else 0, device=device)
         """(N, C) last numbers that were not lost; (N, 0) without loss."""
 
     def update(self, begun: Tensor, again: bool = False) -> None:
@@ -144,7 +142,7 @@ class ObservationErrors:
 
     def _measured(self) -> Tensor:
         """Return the current values of the terms (N, C), with bias and noise."""
-        source = self._source.values
+        source = self._source
         if self._map is not None and self.names == (HEIGHTS,):
             now = self._map.read()  # the heights are the only term with errors
         elif self._map is not None and self._of_map is not None:
@@ -173,7 +171,7 @@ class ObservationErrors:
 
     def _show(self, seen: Tensor) -> None:
         """Write the measured terms `seen` (N, C) into `values`, and copy all other terms."""
-        self.values.copy_(self._source.values)
+        self.values.copy_(self._source)
         if self._slice is not None:
             self.values[:, self._slice].copy_(seen)
         else:

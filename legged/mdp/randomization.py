@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig, Range, draw_of
-from legged.config.schema import LeggedDomainRandConfig
+from legged.config.schema import RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool
@@ -227,7 +227,7 @@ class RobotRandomization(Randomization):
 
     def __init__(
         self,
-        cfg: LeggedDomainRandConfig,
+        cfg: RobotDomainRandConfig,
         num_envs: int,
         device: torch.device,
     ) -> None:
@@ -259,7 +259,7 @@ class Pushes:
 
     def __init__(
         self,
-        cfg: LeggedDomainRandConfig,
+        cfg: RobotDomainRandConfig,
         num_envs: int,
         dt: float,
         device: torch.device,

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from legged.config import LeggedConfig, override
+from legged.config import LeggedConfig, follows_velocities, override
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.play.playground import SETTING, Playground
@@ -102,7 +102,7 @@ def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
     Raises:
         ConfigError: the policy follows no commands.
     """
-    if not isinstance(policy.cfg, LeggedConfig):
+    if not follows_velocities(policy.cfg):
         raise ConfigError(f"{where}'{policy.cfg.task}' follows no commands, so it cannot be told to walk")
     return policy.cfg
 
@@ -119,7 +119,7 @@ def film(policy: TrainedPolicy, side: int) -> Film:
     shares, rough = cfg.terrain.proportions, cfg.terrain.mesh_type != "plane"
     playground = Playground.of(cfg, max(shares, key=lambda name: shares[name]) if rough else None, None)
     changes: list[tuple[str, Any]] = [
-        *undisturbed(1, WARM_UP_S + FILM_S),
+        *undisturbed(cfg, 1, WARM_UP_S + FILM_S),
         ("sim.physics", "mujoco"),
         ("sim.threads", 1),
         ("init_state.yaw", [0.0, 0.0]),
@@ -129,7 +129,7 @@ def film(policy: TrainedPolicy, side: int) -> Film:
     terrain = None
     if playground is not None:
         changes += [*SETTING, *playground.changes(cfg)]
-        terrain = playground.build(override(cfg, changes))  # type: ignore[arg-type]
+        terrain = playground.build(override(cfg, changes))
     task, act = restore(policy, changes, torch.device("cpu"), graph=False, terrain=terrain)
     camera = RobotsCamera(task, 1, SHARP * side, SHARP * side)
     camera.come_near(FILL, GLIDE)

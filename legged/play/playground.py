@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.config import LeggedConfig
-from legged.envs import LeggedRobot
+from legged.config import RobotConfig, TaskConfig, has_robot
+from legged.envs import RobotTask
 from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec, check_terrain, terrain_type, tile_size
 
@@ -39,13 +39,19 @@ class Playground:
     """Indices of the columns in the order in which robots are placed on them."""
 
     @classmethod
-    def of(cls, cfg: LeggedConfig, name: str | None, difficulty: float | None) -> "Playground | None":
+    def of(cls, cfg: TaskConfig, name: str | None, difficulty: float | None) -> "Playground | None":
         """Return the playground for --terrain (`name`) and --difficulty. It has COLUMNS columns of the type `name`. Without
-        `name` it has one column for each terrain type of the task. Without `name`, for a task on a plane, return None.
+        `name` it has one column for each terrain type of the task. Return None without `name` for a task on a plane, and
+        for a task without a robot.
 
         Raises:
-            ConfigError: the type or the difficulty does not exist.
+            ConfigError: the type or the difficulty does not exist, or the task has no ground to choose.
         """
+        if not has_robot(cfg):
+            for flag, given in (("terrain", name), ("difficulty", difficulty)):
+                if given is not None:
+                    raise ConfigError(f"--{flag}: '{cfg.task}' has no terrain to choose; its model contains the ground")
+            return None
         if difficulty is not None and not 0.0 <= difficulty <= 1.0:
             raise ConfigError(f"--difficulty: must be between 0 and 1, got {difficulty:g}")
         if name is not None:
@@ -71,7 +77,7 @@ class Playground:
         front, back = (tuple(TileSpec(kind, size(kind, usual)) for kind in columns) for usual in DIFFICULTIES)
         return cls((front, back), tuple(order))
 
-    def changes(self, cfg: LeggedConfig) -> list[tuple[str, Any]]:
+    def changes(self, cfg: RobotConfig) -> list[tuple[str, Any]]:
         """Return overrides that put a task with the configuration `cfg` on this ground; observations stay as trained."""
         kinds = {spec.type for spec in self.rows[0]}
         shares = dict.fromkeys(cfg.terrain.proportions, 0.0) | {spec.type: 1.0 / len(kinds) for spec in self.rows[0]}
@@ -86,7 +92,7 @@ class Playground:
             ("sim.njmax", max(cfg.sim.njmax, ROWS_NEEDED)),
         ]
 
-    def build(self, cfg: LeggedConfig) -> Terrain:
+    def build(self, cfg: RobotConfig) -> Terrain:
         """Return the terrain. `cfg` is the configuration with the overrides of `changes`; it sets the length of a tile.
 
         Raises:
@@ -99,7 +105,7 @@ class Playground:
         """Return the column index of each robot. All robots move on by `shift` places in `order`."""
         return [self.order[(i + shift) % len(self.order)] for i in range(num_envs)]
 
-    def place(self, task: LeggedRobot, shift: int = 0) -> None:
+    def place(self, task: RobotTask, shift: int = 0) -> None:
         """Assign every robot its tile for the next episodes."""
         assert task.terrain_curriculum is not None, "the task stands on a plane"
         columns = torch.tensor(self.columns(task.num_envs, shift), device=task.device)  # type: ignore[arg-type]

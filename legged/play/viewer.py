@@ -5,7 +5,7 @@ import time
 import torch
 from tensordict import TensorDict
 
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, is_robot_task, is_velocity_task
 from legged.play.playground import Playground
 from legged.policies.episodes import Policy
 from legged.rendering.camera import drawn_model, follow_root, size_of
@@ -50,12 +50,12 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
     """Show the task's first environment, on the `playground` if one is given, in real time until the window is closed."""
     import mujoco.viewer  # imported here, because machines without a display may lack its libraries
 
-    legged = task if isinstance(task, LeggedRobot) else None
-    low, high = legged.command_sampler.full_ranges.t().tolist() if legged else ([0.0] * 3, [0.0] * 3)
+    legged, steered = task if is_robot_task(task) else None, task if is_velocity_task(task) else None
+    low, high = steered.command_sampler.full_ranges.t().tolist() if steered else ([0.0] * 3, [0.0] * 3)
     keyboard = Keyboard(low, high)
     model = display_model(legged.robot, 1, 640, 480, legged.terrain) if legged else drawn_model(task, 640, 480)
     data, simulated = mujoco.MjData(model), mujoco.MjData(task.physics.model)
-    print(HELP if legged else HELP_WITHOUT_COMMANDS)
+    print(HELP if steered else HELP_WITHOUT_COMMANDS)
     if playground:
         print("n goes to the next tile")
     observations = begin_anew(task, playground, keyboard)
@@ -71,8 +71,8 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
             begin = time.perf_counter()
             if keyboard.restart:
                 observations = begin_anew(task, playground, keyboard)
-            if legged:
-                observations = legged.hold_commands(task.physics.qpos.new_tensor(keyboard.command))
+            if steered:
+                observations = steered.hold_commands(task.physics.qpos.new_tensor(keyboard.command))
             observations, _, _, _ = task.step(act(observations))
             with window.lock():
                 task.physics.copy_to(0, simulated)
@@ -84,10 +84,10 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
 
 def begin_anew(task: BaseTask, playground: Playground | None, keyboard: Keyboard) -> TensorDict:
     """Reset the task and return the observations. On a playground, go to the tile chosen by key and print its name."""
-    if playground and isinstance(task, LeggedRobot):
+    if playground and is_robot_task(task):
         playground.place(task, keyboard.tile)
     observations = task.reset()
     keyboard.restart = False
-    if playground and isinstance(task, LeggedRobot) and task.terrain:
+    if playground and is_robot_task(task) and task.terrain:
         print(playground.label(task.terrain, task.base_pos[0].tolist()))
     return observations

@@ -11,7 +11,7 @@ from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.task import TaskConfig
 from legged.deploy.contract import CONTRACT_VERSION, need_of
-from legged.envs import BaseTask, LeggedRobot, RobotTask
+from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
 from legged.envs.marks import unit_of
 from legged.mdp.observations import ObservationTerm
 from legged.robots.crouched_pose import crouch
@@ -64,22 +64,29 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
         "observation_clip": cfg.observations.clip,
         "recurrent": describe_memory(task),
         **describe_estimator(task),
-        **(describe_robot(task) if isinstance(task, LeggedRobot) else describe_model(task)),
+        **(describe_robot(task) if is_robot_task(task) else describe_model(task)),
+        **(describe_commands(task) if is_velocity_task(task) else {}),
     }
 
 
-def describe_robot(task: LeggedRobot) -> dict[str, Any]:
-    """Return the joints of a task's robot, the command ranges and the control law."""
-    cfg, robot, control = task.cfg, task.robot, task.control
+def describe_commands(task: LeggedRobot) -> dict[str, Any]:
+    """Return the ranges and the dead zone of velocity commands."""
     low, high = task.command_sampler.full_ranges.t().tolist()
+    return {
+        "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
+        "command_dead_zone": task.cfg.commands.small_command,
+    }
+
+
+def describe_robot(task: RobotTask) -> dict[str, Any]:
+    """Return the joints of a task's robot and the control law."""
+    cfg, robot, control = task.cfg, task.robot, task.control
     scale, bent = control.action_scale, crouch(robot)
     return {
         "contract_version": CONTRACT_VERSION,
         "robot": robot.name,
         "conventions": conventions(task),
         "imu_frame": {"body": robot.file.base},
-        "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
-        "command_dead_zone": cfg.commands.small_command,
         "joint_names": list(robot.joint_names),
         "action_joints": [robot.joint_names[i] for i in control.acted],
         "default_joint_angles": control.default_dof_pos.tolist(),
@@ -115,7 +122,7 @@ def describe_model(task: BaseTask) -> dict[str, Any]:
     }
 
 
-def conventions(task: LeggedRobot) -> dict[str, str]:
+def conventions(task: RobotTask) -> dict[str, str]:
     """Return the meaning of frames, orders and times, in words."""
     laws = task.control.laws
     law = LAWS[laws[0]] if task.control.law else "; ".join(f"{name} joints: {LAWS[name]}" for name in sorted(set(laws)))
@@ -162,15 +169,15 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         "frame": next((frame for frame in FRAMES if frame in text), None),
         "formula": text or None,
     }
-    if isinstance(task, RobotTask) and term.name == "heights":
+    if is_robot_task(task) and term.name == "heights":
         points = [[round(value, 6) for value in point] for point in task.height_scan.points.tolist()]
         legged = task.cfg.observations
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
         entry["deepest"] = legged.deepest
         entry["scan"] = task.cfg.terrain.scan
-    if isinstance(task, RobotTask) and term.name == "dof_pos" and task.robot.wheels.any():
+    if is_robot_task(task) and term.name == "dof_pos" and task.robot.wheels.any():
         entry["joints"] = [task.robot.joint_names[i] for i in task.robot.without_wheels]
-    if isinstance(task, RobotTask) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
+    if is_robot_task(task) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry
 

@@ -1,7 +1,6 @@
 """Measurements of a policy over full episodes, in any task: returns (in total and by term), lengths and failures."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,26 +8,21 @@ from rich.table import Table
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged.config import TaskConfig
 from legged.envs import BaseTask
-from legged.policies.restore import TrainedPolicy
+from legged.policies.restore import undisturbed
 from legged.tables import screen_table
 
 Policy = Callable[[TensorDict], Tensor]
 """Observations -> actions (N, D)."""
 
 
-def for_episodes(policy: TrainedPolicy, episodes: int) -> tuple[TrainedPolicy, list[tuple[str, Any]]]:
-    """Return the policy without randomisation, and overrides with which each of `episodes` environments runs one episode
-    without noise. Metrics are logged once, at the end.
+def for_episodes(cfg: TaskConfig, episodes: int) -> list[tuple[str, Any]]:
+    """Return overrides with which each of `episodes` undisturbed environments runs one episode. Metrics are logged once, at
+    the end.
     """
-    cfg = policy.cfg
-    calm = replace(policy, cfg=cfg.trained())
     steps = round(cfg.env.episode_length_s / cfg.dt)
-    return calm, [
-        ("env.num_envs", episodes),
-        ("observations.add_noise", False),
-        ("train.runner.num_steps_per_env", steps + 1),
-    ]
+    return [*undisturbed(cfg, episodes), ("train.runner.num_steps_per_env", steps + 1)]
 
 
 def unit_of(task: BaseTask) -> float:

@@ -20,7 +20,7 @@ from legged.config.actuator import MOTORS
 from legged.deploy import weights as kinds
 from legged.deploy.contract import CHECKSUMS
 from legged.deploy.weights import Layer, NumpyNetwork, pack
-from legged.envs import BaseTask, RobotTask
+from legged.envs import BaseTask, is_robot_task
 from legged.errors import RunError
 from legged.learning.estimator import EstimatingModel
 from legged.policies.description import describe
@@ -100,7 +100,7 @@ def export(
         if not difference <= LARGEST_DIFFERENCE:
             raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
         differences[name] = difference
-    if isinstance(task, RobotTask) and (motors := task.cfg.control.actuator.network):
+    if is_robot_task(task) and (motors := task.cfg.control.actuator.network):
         files[MOTORS] = Path(motors).read_bytes()
     make_folder(folder)
     for name, content in files.items():

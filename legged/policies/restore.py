@@ -54,17 +54,12 @@ def policy_of(name: str, checkpoint: int | str | None = None, where: str = "POLI
     return TrainedPolicy(cfg, find_checkpoint(folder, checkpoint))
 
 
-def undisturbed(num_envs: int, seconds: float) -> list[tuple[str, Any]]:
-    """Return overrides for measurements: the model's friction and mass, long episodes, and no noise, pushes or curriculum."""
-    return [
-        ("env.num_envs", num_envs),
-        ("env.episode_length_s", seconds + 10.0),
-        ("observations.add_noise", False),
-        ("domain_rand.randomize_friction", False),
-        ("domain_rand.randomize_base_mass", False),
-        ("domain_rand.push_robots", False),
-        ("commands.curriculum.enabled", False),
-    ]
+def undisturbed(cfg: TaskConfig, num_envs: int, seconds: float | None = None) -> list[tuple[str, Any]]:
+    """Return overrides for measurements without noise, pushes and curricula, and with the model's friction and mass. If
+    `seconds` is given, no episode ends by time within `seconds`; otherwise episodes are as long as in the training.
+    """
+    length = [] if seconds is None else [("env.episode_length_s", seconds + 10.0)]
+    return [("env.num_envs", num_envs), *length, *((path, False) for path in cfg.DISTURBANCES)]
 
 
 def nominal(cfg: TaskConfig, changes: Iterable[tuple[str, Any]]) -> TaskConfig:

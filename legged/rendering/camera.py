@@ -15,7 +15,7 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from PIL import Image, ImageDraw, ImageFont
 
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
 from legged.errors import RunError
 from legged.process import headless
 from legged.process.headless import HEADLESS, off_screen_library
@@ -262,10 +262,10 @@ class Follower:
 class RobotsCamera(Camera):
     """A camera for `count` robots of a task: the first ones, or those that `turn_to` selects. On a plane the robots are drawn
     side by side, and the camera follows their middle. On terrain it follows one of them, the robot number `followed`. Arrows
-    show the commanded and the actual velocity.
+    show the commanded and the actual velocity of robots that follow velocity commands.
     """
 
-    def __init__(self, task: LeggedRobot, count: int, width: int = 960, height: int = 540) -> None:
+    def __init__(self, task: RobotTask, count: int, width: int = 960, height: int = 540) -> None:
         """Build the scene and its renderer.
 
         Raises:
@@ -280,7 +280,7 @@ class RobotsCamera(Camera):
         self.centre = np.array([0.0, 0.0, 0.5 * self.sides[2]])
         """(3,) point that the camera looks at on a plane, relative to the ground below the middle of the robots [m]."""
         self.arrows = True
-        """True if the arrows of the velocities are drawn."""
+        """True if the arrows of velocities are drawn."""
         self.ground = None if task.terrain is None else task.terrain.height_map
         if self.ground is None:
             self.offsets = SPACING * length * side_by_side(count, int(np.ceil(count**0.5)))
@@ -321,16 +321,21 @@ class RobotsCamera(Camera):
         self.follower.update(middle if self.ground is None else bases[self.followed])
         self.update()
         self._shade_feet()
-        commands = self.task.commands[drawn, :2].cpu().numpy()
-        actual = self.task.base_lin_vel[drawn, :2].cpu().numpy()
-        for i in range(self.count if self.arrows else 0):
+        if self.arrows and is_velocity_task(self.task):
+            self._draw_velocities(self.task, bases, drawn)
+        return caption(self.render(), lines, (COMMANDED, ACTUAL))
+
+    def _draw_velocities(self, task: LeggedRobot, bases: np.ndarray, drawn: slice) -> None:
+        """Draw two arrows above each of `bases` (count, 3) [m]: the commanded velocity, and above it the actual one."""
+        commands = task.commands[drawn, :2].cpu().numpy()
+        actual = task.base_lin_vel[drawn, :2].cpu().numpy()
+        for i in range(self.count):
             matrix = self.data.body(f"{i}/{self.task.robot.file.base}").xmat.reshape(3, 3)
             yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
             turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
             above = bases[i] + np.array([0.0, 0.0, ABOVE * self.length])
             self._arrow(above, turn @ commands[i], COMMANDED)
             self._arrow(above + np.array([0.0, 0.0, APART * self.length]), turn @ actual[i], ACTUAL)
-        return caption(self.render(), lines, (COMMANDED, ACTUAL))
 
     def _shade_feet(self) -> None:
         """Draw a dark spot on the ground below each foot instead of a shadow."""
@@ -395,12 +400,12 @@ def follow_root(view: mujoco.MjvCamera, model: mujoco.MjModel) -> None:
 
 
 def camera_of(task: BaseTask, count: int = 1, width: int = 960, height: int = 540) -> ModelCamera | RobotsCamera:
-    """Return a camera for pictures of `width` x `height` [pixels]. In a `LeggedRobot` task it draws the first `count` robots.
+    """Return a camera for pictures of `width` x `height` [pixels]. In a task with a robot it draws the first `count` robots.
 
     Raises:
         RunError: this machine cannot render.
     """
-    if isinstance(task, LeggedRobot):
+    if is_robot_task(task):
         return RobotsCamera(task, count, width, height)
     return ModelCamera(task, width, height)
 

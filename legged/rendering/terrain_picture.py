@@ -9,7 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged.config import LeggedConfig
+from legged.config import RobotConfig
 from legged.config.schema import TerrainConfig
 from legged.figures import figure, import_matplotlib
 from legged.rendering.camera import Camera, frame, labels
@@ -38,7 +38,7 @@ def tiles(cfg: TerrainConfig, rows: Sequence[Sequence[str]], difficulty: float, 
     return Terrain.of_tiles(specs, replace(cfg, border_size=MARGIN), np.random.default_rng(seed))
 
 
-def picture_of_types(cfg: LeggedConfig, types: Sequence[str], difficulty: float) -> np.ndarray:
+def picture_of_types(cfg: RobotConfig, types: Sequence[str], difficulty: float) -> np.ndarray:
     """Return a picture (height, width, 3) uint8 of one labelled tile for each terrain type. A robot stands on each tile. The
     tiles run row by row from the upper left corner.
 

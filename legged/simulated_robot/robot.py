@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import torch
 
-from legged.config import LeggedConfig, override
+from legged.config import has_robot, override
 from legged.config.loader import from_dict
 from legged.config.schema import ActuatorConfig, SimConfig
 from legged.deploy.contract import SCANS, Contract
@@ -58,7 +58,7 @@ def motors_config(
             trained_with["network"] = str(contract.path.parent / str(network))
         source, own = f"{contract.path}: actuator", {"control": {"actuator": trained_with}}
     cfg = override(from_dict({"task": "simulated", "robot": str(robot.folder), **own}, source=source), changes)
-    assert isinstance(cfg, LeggedConfig)
+    assert has_robot(cfg)
     try:
         check_actuator(robot, cfg.control, dt, cfg.origins.where)
     except ConfigError as error:

@@ -10,7 +10,7 @@ import torch
 from helpers import call, small_task
 
 from legged.cli import deploy
-from legged.config.schema import ActuatorConfig, LeggedControlConfig, SimConfig
+from legged.config.schema import ActuatorConfig, RobotControlConfig, SimConfig
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError
 from legged.learning.runner import Runner
@@ -59,7 +59,7 @@ def test_torques_are_those_of_the_tasks_motors(settings, tmp_path):
     if "network" in settings:
         settings = {"network": network(tmp_path), "joints": ("KFE",)}
     own = motors(**settings)
-    control = Control(ROBOT, LeggedControlConfig(actuator=ActuatorConfig(**settings)), torch.zeros(1, JOINTS), DT)
+    control = Control(ROBOT, RobotControlConfig(actuator=ActuatorConfig(**settings)), torch.zeros(1, JOINTS), DT)
     random = torch.Generator().manual_seed(2)
     gains = np.stack([control.stiffness, control.damping]).astype(float)
     differ = 0.0

@@ -17,7 +17,7 @@ from legged.cli.main import COMMANDS, load, main, sub_commands
 from legged.commandline.arguments import overrides
 from legged.config import from_dict
 from legged.config.loader import read_yaml
-from legged.process.command_parser import CommandParser
+from legged.deploy.command_parser import CommandParser
 from legged.registry import task_config, task_names
 
 pytestmark = pytest.mark.usefixtures("workplace")

@@ -2,16 +2,19 @@
 
 import pytest
 
-from legged.process.command_parser import CommandParser
+from legged.commandline.command import sub_command
+from legged.deploy.command_parser import CommandParser, argument
 
 
 @pytest.mark.parametrize("given", ["--num_envs", "--num-envs"])
 @pytest.mark.parametrize("form", ["{}=3", "{} 3"])
 def test_options_of_legged_gym_are_read_with_underscores_too(given, form):
-    parser = CommandParser("x", "Do.", "x a", "x b")
-    parser.add_argument("--num-envs", type=int)
-    parser.add_argument("rest", nargs="*")
-    args = parser.parse_args(["a_b=num_envs", *form.format(given).split()])
+    @sub_command("x a", "x b", arguments=(argument("--num-envs", type=int), argument("rest", nargs="*")))
+    def command(_args):
+        """Do."""
+        return 0
+
+    args = command.parse(["a_b=num_envs", *form.format(given).split()])
     assert (args.num_envs, args.rest) == (3, ["a_b=num_envs"])
 
 

@@ -1,9 +1,12 @@
 """policy.json as a contract: what is in it, which ones are refused and how, and that a robot gets what the task would."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -13,6 +16,7 @@ from helpers import CALM, ENGINE
 from onnx import numpy_helper
 from still_robot import BLIND, PROPRIOCEPTION, SMALL, exported, facts_for
 
+from legged.deploy import contract as contracts
 from legged.deploy.contract import CONTRACT_VERSION, need_of, read_contract
 from legged.deploy.interface import Reading
 from legged.deploy.policy import Policy
@@ -384,6 +388,26 @@ def test_it_needs_numpy_and_onnxruntime_alone(folder):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.split("\n")[:2] == ["90 torch is blocked", "[]"], done.stdout + done.stderr
+
+
+def test_it_runs_as_a_copy_of_its_folder_alone(folder, tmp_path):
+    """A robot's computer needs the folder `deploy`, and no other part of the package."""
+    shutil.copytree(Path(contracts.__file__).parent, tmp_path / "legged" / "deploy")
+    (tmp_path / "legged" / "__init__.py").touch()  # so that an installed package of this name is not found instead
+    (tmp_path / "orders.txt").write_text("0 damping\n1 quit\n", encoding="utf-8")
+    code = f"{BLOCKED}import runpy\nrunpy.run_module('legged.deploy', run_name='__main__', alter_sys=True)\n"
+    alone = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+    def run(*arguments):
+        command = [sys.executable, "-c", code, *arguments]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False, env=alone)
+
+    assert "--stand-seconds" in run("--help").stdout
+    robot = ("--robot", "udp:127.0.0.1:9")  # nobody listens at this port
+    assert "did you mean '--log'?" in run(str(folder), *robot, "--logs", "a.npz").stderr
+    done = run(str(folder), *robot, "--commands", "orders.txt")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: --robot: no robot answers at udp:127.0.0.1:9"), done.stderr
 
 
 @pytest.mark.slow

@@ -215,7 +215,7 @@ def test_a_script_with_a_mistake_is_refused_by_its_line(tmp_path, text, says):
         (["--robot", "spot"], 2, "error: --robot: 'spot' is unknown"),
         (["--robot", "udp:here", "--commands", "walk.txt"], 2, "error: --robot: udp:here: expected udp:HOST:PORT"),
         (["--log", "walk.txt"], 2, "error: --log: must be the name of an .npz file, got 'walk.txt'"),
-        (["--log", "walk.txt/log.npz"], 2, "error: walk.txt: cannot make the folder: walk.txt is a file"),
+        (["--log", "walk.txt/log.npz"], 2, "error: --log: cannot write to the folder walk.txt: File exists"),
         (["--robot", "go2"], 2, "joint_names: 'go2' has no joint 'LF_HAA'"),
         (["--commands", "nothing.txt"], 2, "error: --commands: nothing.txt: cannot be read"),
         (["--input", "gamepad", "--gamepad", "js9"], 2, "error: --input: there is no gamepad at js9"),

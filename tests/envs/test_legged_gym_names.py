@@ -10,8 +10,7 @@ from helpers import CALM, ENGINE, JOINTS, small_config, small_task, zero_actions
 from torch import Tensor
 
 from legged.envs import LeggedRobot
-from legged.envs.legged_gym_names import ABSENT, COMPUTED, CONSTANT, KEPT, PLAIN, SUBSTEPS
-from legged.envs.views import ReadOnly
+from legged.envs.legged_gym_names import ABSENT, COMPUTED, CONSTANT, KEPT, PLAIN, SUBSTEPS, ReadOnly
 from legged.errors import ConfigError
 from legged.math import get_euler_xyz, quat_apply_yaw, quat_from_angle_axis, quat_rotate, quat_rotate_inverse
 from legged.registry import make_task, task_config

@@ -68,7 +68,7 @@ def test_friction_and_mass_that_a_flag_draws_are_observed_by_their_ranges_where_
         ("domain_rand.added_mass_range", [-1.0, 3.0]),
         observing("rand_friction", "rand_added_base_mass"),
     )
-    task = make_task(nominal(cfg, undisturbed(2, 1.0)))
+    task = make_task(nominal(cfg, undisturbed(cfg, 2, 1.0)))
     assert task._obs_rand_friction().flatten().tolist() == [0.0] * 2
     assert task._obs_rand_added_base_mass().flatten().tolist() == [-0.5] * 2
 

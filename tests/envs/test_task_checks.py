@@ -109,9 +109,11 @@ def test_a_policy_is_measured_on_the_nominal_model_unless_told_otherwise(tmp_pat
     cfg = small_config(*((f"domain_rand.ranges.{name}", [0.9, 1.1]) for name in ("friction", "link_mass")))
     folder = data_folder("resources") / "policies" / TASK
     policy = TrainedPolicy(cfg, folder / "model.pt")
-    task, _ = restore(policy, undisturbed(2, 1.0), torch.device("cpu"))
+    task, _ = restore(policy, undisturbed(policy.cfg, 2, 1.0), torch.device("cpu"))
     assert task.randomization.fields == {}
-    other, _ = restore(policy, [*undisturbed(2, 1.0), ("domain_rand.ranges.friction", [0.7, 0.7])], torch.device("cpu"))
+    other, _ = restore(
+        policy, [*undisturbed(policy.cfg, 2, 1.0), ("domain_rand.ranges.friction", [0.7, 0.7])], torch.device("cpu")
+    )
     assert list(other.randomization.fields) == ["friction"]
 
 

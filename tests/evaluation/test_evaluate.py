@@ -26,8 +26,9 @@ pytestmark = pytest.mark.usefixtures("workplace")
 
 
 def on_grid(grid: Grid, act=stand, *settings):
-    changes = [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0]), *settings]
-    return measure_tracking(make_task(override(small_config(), changes)), act, grid)
+    cfg = small_config()
+    changes = [*undisturbed(cfg, grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0]), *settings]
+    return measure_tracking(make_task(override(cfg, changes)), act, grid)
 
 
 # ---- the grid --------------------------------------------------------------------------------------------------------
@@ -82,7 +83,9 @@ def test_robots_that_stand_have_the_error_of_what_they_are_asked_for():
 @pytest.mark.slow
 def test_robots_that_are_made_to_fall_are_counted_and_measured_up_to_their_fall():
     grid = Grid([0.0, 0.5], [0.0], [0.0], robots=4, hold_s=1.0, settle_s=0.2)
-    config = override(small_config(), [*undisturbed(grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0])])
+    config = override(
+        small_config(), [*undisturbed(small_config(), grid.num_envs, grid.hold_s), ("init_state.base_velocity", [0.0, 0.0])]
+    )
     task = make_task(config)
     steps = 0
 
@@ -115,7 +118,7 @@ def test_a_cell_in_which_nobody_stands_long_enough_to_be_measured_does_not_count
 @pytest.mark.slow
 def test_a_robot_is_measured_up_to_a_time_out_and_has_not_fallen():
     """Its time is up at the end of step 15, so that of 30 steps those from 10 to 13 are of its first episode."""
-    task = make_task(override(small_config(), [*undisturbed(2, 0.6), ("env.episode_length_s", 0.3)]))
+    task = make_task(override(small_config(), [*undisturbed(small_config(), 2, 0.6), ("env.episode_length_s", 0.3)]))
     sums, fell, lost = hold(task, stand, torch.tensor([[0.5, 0.0, 0.0]] * 2), 0.2, 0.6, lambda _: {"ones": torch.ones(2, 3)})
     assert sums["steps"].tolist() == [4.0, 4.0]
     assert sums["ones"].tolist() == [[4.0] * 3] * 2

@@ -259,7 +259,7 @@ def test_the_policy_sees_what_it_saw_in_training():
         (f"observations.height_map.{error}", 0.0) for error in ("offset", "shift", "drift", "shift_drift", "holes", "lost")
     ]
     cfg = task_config("anymal_c", [("env.num_envs", 2), *exact, *ENGINE], on_cpu=True)
-    changed = override(cfg, [*undisturbed(2, 20.0), *on_terrain(cfg, 8.0, 0.1), ("observations.add_noise", True)])
+    changed = override(cfg, [*undisturbed(cfg, 2, 20.0), *on_terrain(cfg, 8.0, 0.1), ("observations.add_noise", True)])
     task = make_task(changed, terrain=tiles_of_sizes("pit", [0.4], changed.terrain, 1))
     success.place(task, 2)
     seen = task.reset()
@@ -333,7 +333,12 @@ def test_ground_of_a_scale_that_is_asked_for_is_measured_and_told_at_that_scale(
 def test_the_shipped_policy_climbs_a_gentle_slope_and_not_a_wall():
     """The whole measurement, with a policy that walks: 10 degrees are easy for it, a pit of 1 m has walls."""
     policy = TrainedPolicy(run_config(POLICY), find_checkpoint(POLICY, None))
-    changes = [*undisturbed(8, 20.0), *ENGINE, *on_terrain(policy.cfg, 8.0, 0.1), ("commands.heading_command", True)]
+    changes = [
+        *undisturbed(policy.cfg, 8, 20.0),
+        *ENGINE,
+        *on_terrain(policy.cfg, 8.0, 0.1),
+        ("commands.heading_command", True),
+    ]
     changes.append(("init_state.yaw", [-math.pi, math.pi]))
     cfg = override(policy.cfg, changes)
 

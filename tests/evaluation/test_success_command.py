@@ -182,7 +182,7 @@ def test_types_are_measured_in_cells_that_make_what_they_are_called():
 @pytest.mark.slow
 def test_height_of_the_gait_is_above_the_ground():
     grid = Grid([0.0], [0.0], [0.0], robots=2, hold_s=1.0, settle_s=0.5)
-    cfg = override(small_config(), [*undisturbed(2, 1.0), *on_terrain(small_config(), 8.0, 0.1)])
+    cfg = override(small_config(), [*undisturbed(small_config(), 2, 1.0), *on_terrain(small_config(), 8.0, 0.1)])
     pit = Terrain.of_tiles([[TileSpec("pit", 0.8)]], cfg.terrain, None)
     result = measure_tracking(make_task(cfg, terrain=pit), stand, grid)
     assert 0.45 < result["gait"]["base_height"] < 0.6
@@ -192,8 +192,9 @@ def test_height_of_the_gait_is_above_the_ground():
 @pytest.mark.slow
 def test_lost_contacts_are_counted_over_all_rollouts(monkeypatch):
     grid = Grid([0.0], [0.0], [0.0], robots=3, hold_s=0.6, settle_s=0.2)
-    changes = [*undisturbed(3, 0.6), ("train.runner.num_steps_per_env", 24)]  # so that 30 steps are a rollout and a part
-    task = make_task(override(small_config(), changes))
+    cfg = small_config()
+    changes = [*undisturbed(cfg, 3, 0.6), ("train.runner.num_steps_per_env", 24)]  # so that 30 steps are a rollout and a part
+    task = make_task(override(cfg, changes))
     refresh = task.physics.refresh
 
     def lose():

@@ -19,10 +19,10 @@ from legged.cli.train import train
 from legged.commandline.arguments import POLICY, policy_overrides
 from legged.config import from_dict
 from legged.config.loader import read_yaml
+from legged.deploy.command_parser import CommandParser
 from legged.learning.run_folder import find_run, run_config
 from legged.learning.runner import Runner
 from legged.policies.restore import policy_of
-from legged.process.command_parser import CommandParser
 from legged.registry import make_task, task_config
 
 REPOSITORY = Path(legged.__file__).parents[1]

@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import small_task
 
-from legged.config.schema import LeggedControlConfig
+from legged.config.schema import RobotControlConfig
 from legged.errors import ConfigError
 from legged.learning.runner import Runner
 from legged.mdp.control import Control
@@ -24,7 +24,7 @@ def rows(*first_leg: float) -> torch.Tensor:
 
 def test_scales_by_joint_and_joints_that_are_held_by_hand():
     """HFE scaled by 0.5 and KFE by 2, the left front one by 4; HAA has no action."""
-    cfg = LeggedControlConfig(
+    cfg = RobotControlConfig(
         stiffness={"HAA": 10.0, "HFE": 20.0, "KFE": 30.0},
         damping={"HAA": 0.0, "HFE": 0.0, "KFE": 0.0},
         action_scale={"HFE": 0.5, "KFE": 2.0, "LF_KFE": 4.0},

@@ -10,8 +10,8 @@ from helpers import assert_goes_on_alike, small_task
 
 from legged.config import override
 from legged.config.actuator import ActuatorConfig
-from legged.config.legged import LeggedControlConfig
 from legged.config.loader import from_dict
+from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
 from legged.mdp.actuator import Friction, MotorCurve, check_motor_model, is_ideal
 from legged.mdp.actuator_network import NetworkWeights
@@ -31,7 +31,7 @@ def control(kernels=None, law="P", decimation=4, **actuator) -> Control:
     """The control of N robots with gains 100 and 2, drawn delays among them."""
     numbers = RandomPool(N, torch.device("cpu"))
     gains = {"stiffness": {"H": 100.0, "K": 100.0}, "damping": {"H": 2.0, "K": 2.0}, "action_scale": 1.0}
-    cfg = LeggedControlConfig(decimation, control_type=law, actuator=ActuatorConfig(**actuator), **gains)
+    cfg = RobotControlConfig(decimation, control_type=law, actuator=ActuatorConfig(**actuator), **gains)
     made = Control(ROBOT, cfg, torch.zeros(N, D), DT, kernels, numbers)
     numbers.allocate()
     made.numbers = numbers

@@ -30,7 +30,8 @@ class Bench:
         self.clock = torch.zeros(())
         self.terms = ObservationTerms({"a": self.a, "b": self.b})
         self.numbers = RandomPool(N, torch.device("cpu"))
-        self.errors = ObservationErrors(self.terms, names, bias or {}, delay or {}, dropped or {}, noise or {}, self.numbers)
+        layout, tables = (self.terms.values, self.terms.columns), (bias or {}, delay or {}, dropped or {}, noise or {})
+        self.errors = ObservationErrors(*layout, names, *tables, self.numbers)
         self.terms.errors = self.errors
         self.numbers.allocate()
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, LeggedControlConfig
+from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, RobotControlConfig
 from legged.errors import TermError
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
@@ -313,7 +313,7 @@ def test_a_state_that_was_saved_before_stances_were_timed_does_not_fit():
 
 def control(kind: str | dict[str, str]) -> Control:
     """ANYmal C with gains 10 / 2, 20 / 3 and 30 / 4 for HAA, HFE and KFE, two robots, 5 ms."""
-    cfg = LeggedControlConfig(
+    cfg = RobotControlConfig(
         control_type=kind,
         stiffness={"HAA": 10.0, "HFE": 20.0, "KFE": 30.0},
         damping={"HAA": 2.0, "HFE": 3.0, "KFE": 4.0},

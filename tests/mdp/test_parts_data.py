@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from legged.config.schema import LeggedDomainRandConfig
+from legged.config.schema import RobotDomainRandConfig
 from legged.errors import TermError
 from legged.mdp.metrics import Metrics
 from legged.mdp.observations import ObservationGroup, ObservationTerms
@@ -262,7 +262,7 @@ class FakePhysics:
 
 
 def test_friction_comes_from_as_many_values_as_there_are_buckets():
-    cfg = LeggedDomainRandConfig(friction_range=(0.5, 1.25), friction_buckets=8)
+    cfg = RobotDomainRandConfig(friction_range=(0.5, 1.25), friction_buckets=8)
     friction = RobotRandomization(cfg, 5000, CPU).friction
     assert len(friction.unique()) == 8
     assert friction.min() >= 0.5
@@ -271,7 +271,7 @@ def test_friction_comes_from_as_many_values_as_there_are_buckets():
 
 
 def test_added_masses_fill_their_range():
-    mass = RobotRandomization(LeggedDomainRandConfig(added_mass_range=(-5.0, 3.0)), 5000, CPU).added_mass
+    mass = RobotRandomization(RobotDomainRandConfig(added_mass_range=(-5.0, 3.0)), 5000, CPU).added_mass
     assert -5.0 <= mass.min() < -4.95
     assert 2.95 < mass.max() <= 3.0
     assert mass.mean() == pytest.approx(-1.0, abs=0.15)
@@ -280,10 +280,10 @@ def test_added_masses_fill_their_range():
 def test_properties_are_drawn_once_from_their_ranges_and_given_by_name():
     """They come after friction and mass, so that to add a range changes neither; a range takes their place."""
     torch.manual_seed(3)
-    plain = RobotRandomization(LeggedDomainRandConfig(), 2000, CPU)
+    plain = RobotRandomization(RobotDomainRandConfig(), 2000, CPU)
     torch.manual_seed(3)
     ranges = {"joint_damping": (0.5, 1.5), "actuator_gain": (-5.0, 5.0)}
-    randomization, physics = RobotRandomization(LeggedDomainRandConfig(ranges=ranges), 2000, CPU), FakePhysics(2000)
+    randomization, physics = RobotRandomization(RobotDomainRandConfig(ranges=ranges), 2000, CPU), FakePhysics(2000)
     assert torch.equal(randomization.friction, plain.friction)
     assert torch.equal(randomization.added_mass, plain.added_mass)
     randomization.apply(physics)
@@ -293,7 +293,7 @@ def test_properties_are_drawn_once_from_their_ranges_and_given_by_name():
         assert low <= values.min() < low + 0.01 * (high - low)
         assert high - 0.01 * (high - low) < values.max() <= high
     assert torch.corrcoef(randomization.drawn.t())[0, 1].abs() < 0.1  # fields are drawn apart
-    narrow = RobotRandomization(LeggedDomainRandConfig(ranges={"friction": (2.0, 2.1)}), 50, CPU)
+    narrow = RobotRandomization(RobotDomainRandConfig(ranges={"friction": (2.0, 2.1)}), 50, CPU)
     assert narrow.fields["friction"].min() >= 2.0
 
 
@@ -309,7 +309,7 @@ def test_what_was_drawn_is_put_back():
 
 @pytest.mark.parametrize(("friction", "mass"), [(True, False), (False, True), (False, False)])
 def test_the_physics_is_given_what_is_asked_for_and_no_more(friction, mass):
-    cfg = LeggedDomainRandConfig(randomize_friction=friction, randomize_base_mass=mass)
+    cfg = RobotDomainRandConfig(randomize_friction=friction, randomize_base_mass=mass)
     randomization, physics = RobotRandomization(cfg, 3, CPU), FakePhysics(3)
     randomization.apply(physics)
     assert ("friction" in physics.given, "added_base_mass" in physics.given) == (friction, mass)
@@ -330,7 +330,7 @@ def push_steps(pushes: Pushes, physics: FakePhysics, steps: int, allowed: torch.
 
 @pytest.mark.parametrize("interval_s", [1.0, 2.0, 15.0])
 def test_each_robot_is_pushed_at_its_own_moments_exactly_one_interval_apart(interval_s):
-    pushes, physics = Pushes(LeggedDomainRandConfig(push_interval_s=interval_s), 40, DT, CPU), FakePhysics(40)
+    pushes, physics = Pushes(RobotDomainRandConfig(push_interval_s=interval_s), 40, DT, CPU), FakePhysics(40)
     interval = round(interval_s / DT)
     found = push_steps(pushes, physics, 4 * interval, torch.ones(40, dtype=torch.bool))
     firsts = [steps[0] for steps in found]
@@ -342,7 +342,7 @@ def test_each_robot_is_pushed_at_its_own_moments_exactly_one_interval_apart(inte
 
 
 def test_a_push_sets_the_horizontal_velocity_inside_its_range():
-    pushes, physics = Pushes(LeggedDomainRandConfig(max_push_vel_xy=0.8), 2000, DT, CPU), FakePhysics(2000)
+    pushes, physics = Pushes(RobotDomainRandConfig(max_push_vel_xy=0.8), 2000, DT, CPU), FakePhysics(2000)
     pushes.push_time_left.fill_(0.0)
     pushes.numbers.draw()
     pushes.push(physics, torch.ones(2000, dtype=torch.bool))
@@ -354,10 +354,10 @@ def test_a_push_sets_the_horizontal_velocity_inside_its_range():
 
 
 def test_robots_outside_the_mask_are_pushed_later_and_none_with_pushes_off():
-    pushes, physics = Pushes(LeggedDomainRandConfig(push_interval_s=1.0), 2, DT, CPU), FakePhysics(2)
+    pushes, physics = Pushes(RobotDomainRandConfig(push_interval_s=1.0), 2, DT, CPU), FakePhysics(2)
     pushes.push_time_left.fill_(0.055)
     assert push_steps(pushes, physics, 10, mask(True, False)) == [[3], []]
     assert push_steps(pushes, physics, 1, mask(True, True)) == [[], [1]]
-    off = Pushes(LeggedDomainRandConfig(push_robots=False), 2, DT, CPU)
+    off = Pushes(RobotDomainRandConfig(push_robots=False), 2, DT, CPU)
     physics.due.fill_(False)
     assert push_steps(off, physics, 800, mask(True, True)) == [[], []]

@@ -9,7 +9,7 @@ import torch
 from helpers import small_config, small_task
 
 from legged.config.actuator import ActuatorConfig
-from legged.config.legged import LeggedControlConfig
+from legged.config.robot import RobotControlConfig
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
 from legged.mdp.actuator import MotorCurve, check_actuator, with_rotors
@@ -61,7 +61,7 @@ def test_a_line_that_is_too_steep_for_the_physics_step_is_refused_and_the_number
     knee = robot.joint_names.index("LF_KFE")
     assert robot.inertia[knee] == pytest.approx(0.0143, abs=2e-4)  # 1 / (M^-1)_ii of the model in its default pose
     with pytest.raises(ConfigError) as error:
-        check_actuator(robot, LeggedControlConfig(actuator=ActuatorConfig(**ANYDRIVE)), dt)
+        check_actuator(robot, RobotControlConfig(actuator=ActuatorConfig(**ANYDRIVE)), dt)
     told = re.search(
         r"^control.actuator.stall_torque: '.._KFE' turns 0.014 kg m\^2 with the leg in the air, .* 120 N m at rest and 0 N m "
         r"at 7.5 rad/s: .* 0.005 s .* \(control.actuator.armature, ([0-9.]+) kg m\^2 or more\), or make sim.dt ([0-9.]+) s",
@@ -71,12 +71,12 @@ def test_a_line_that_is_too_steep_for_the_physics_step_is_refused_and_the_number
     enough, short = map(float, told.groups())
     assert enough == pytest.approx(120.0 * dt / (2.0 * 7.5) - 0.0143, rel=0.1)
     assert short == pytest.approx(2.0 * 0.0143 * 7.5 / 120.0, rel=0.1)
-    check_actuator(robot, LeggedControlConfig(actuator=ActuatorConfig(**ANYDRIVE)), short)
-    heavy = LeggedControlConfig(actuator=ActuatorConfig(**ANYDRIVE, armature={"K": enough}))
+    check_actuator(robot, RobotControlConfig(actuator=ActuatorConfig(**ANYDRIVE)), short)
+    heavy = RobotControlConfig(actuator=ActuatorConfig(**ANYDRIVE, armature={"K": enough}))
     check_actuator(robot, heavy, dt)
     check_actuator(with_rotors(robot, heavy.actuator), heavy, dt)  # what a robot has is not added once more
     ideal = ActuatorConfig(**{**ANYDRIVE, "joints": ("HAA", "HFE")})  # their legs are heavy enough
-    check_actuator(robot, LeggedControlConfig(actuator=ideal), dt)
+    check_actuator(robot, RobotControlConfig(actuator=ideal), dt)
 
 
 @pytest.mark.parametrize(

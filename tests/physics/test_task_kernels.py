@@ -7,15 +7,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from legged.config.legged import (
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.robot import HeightMapConfig
+from legged.config.schema import (
     CommandCurriculumConfig,
     CommandsConfig,
-    LeggedControlConfig,
-    LeggedDomainRandConfig,
+    RobotControlConfig,
+    RobotDomainRandConfig,
     TerrainConfig,
 )
-from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
-from legged.config.sensors import HeightMapConfig
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
@@ -56,7 +56,7 @@ def chance(share: float, *shape: int) -> torch.Tensor:
 
 def test_joints_are_held_alike_at_their_limits_too():
     robot = load_robot("anymal_c")
-    laws = pair(lambda kernels: Control(robot, LeggedControlConfig(), torch.zeros(N, 12), 0.005, kernels))
+    laws = pair(lambda kernels: Control(robot, RobotControlConfig(), torch.zeros(N, 12), 0.005, kernels))
     actions, state = torch.randn(N, 12), torch.randn(2, N, 30)
     state[0, 3, 10] = torch.nan
     torques = []
@@ -167,7 +167,7 @@ class Velocities:
 
 
 def test_robots_are_pushed_alike():
-    cfg = replace(LeggedDomainRandConfig(), push_interval_s=0.3)
+    cfg = replace(RobotDomainRandConfig(), push_interval_s=0.3)
     parts, worlds = pair(lambda kernels: Pushes(cfg, N, DT, CPU, kernels)), (Velocities(), Velocities())
     for step in range(40):
         mask = chance(0.9, N)
@@ -251,7 +251,7 @@ def test_numbers_are_drawn_again_alike(chosen):
 
 def test_the_control_law_varies_alike_and_keeps_what_was_drawn_at_the_start():
     robot = load_robot("anymal_c")
-    laws = pair(lambda kernels: Control(robot, LeggedControlConfig(), torch.zeros(N, 12), 0.005, kernels))
+    laws = pair(lambda kernels: Control(robot, RobotControlConfig(), torch.zeros(N, 12), 0.005, kernels))
     drawn = {"p_gain": 0.5 + torch.rand(N), "torque_limit": 0.5 + torch.rand(N, 12), "joint_offset": 0.1 * torch.rand(N, 12)}
     again = {"d_gain": 0.5 + torch.rand(N, 1)}
     for law in laws:
@@ -288,7 +288,7 @@ def test_kicks_and_forces_come_and_end_alike(of):
     trip = KickConfig(interval_s=(0.2, 0.2), y=(-1.0, 1.0), grow=(0.0, 1.0))
     pull = ForceConfig(body="", interval_s=(0.05, 0.2), duration_s=(0.04, 0.1), y=(-50.0, 50.0))
     lift = ForceConfig(body="", interval_s=(0.1, 0.1), duration_s=(0.02, 0.1), z=(0.0, 50.0))
-    cfg = LeggedDomainRandConfig(
+    cfg = RobotDomainRandConfig(
         kicks={"kick": kick, "trip": trip} if "kicks" in of else {},
         forces={"pull": pull, "lift": lift} if "forces" in of else {},
     )

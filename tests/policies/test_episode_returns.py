@@ -7,7 +7,7 @@ from helpers import small_config
 
 from legged.config import override
 from legged.policies.episodes import episodes_table, for_episodes, measure_episodes, spread_of
-from legged.policies.restore import TrainedPolicy
+from legged.policies.restore import nominal
 from legged.registry import make_task, task_config
 
 ENGINE = [("sim.physics", "mujoco"), ("sim.threads", 1)]
@@ -91,11 +91,10 @@ def test_spread_by_hand():
     assert spread_of([1.0, 2.0, 6.0]) == {"mean": 3.0, "std": pytest.approx((14 / 3) ** 0.5), "min": 1.0, "max": 6.0}
 
 
-def test_a_policy_is_measured_without_noise_and_randomisation(tmp_path):
+def test_a_policy_is_measured_without_noise_and_randomisation():
     cfg = task_config("humanoid", ENGINE, on_cpu=True)
     assert cfg.domain_rand.ranges
-    calm, changes = for_episodes(TrainedPolicy(cfg, tmp_path / "model_0.pt"), 7)
-    found = override(calm.cfg, changes)
+    found = nominal(cfg, for_episodes(cfg, 7))
     assert (found.env.num_envs, found.domain_rand.ranges, found.observations.add_noise) == (7, {}, False)
     assert found.train.runner.num_steps_per_env > round(cfg.env.episode_length_s / cfg.dt)
     assert (found.env.episode_length_s, found.rewards) == (cfg.env.episode_length_s, cfg.rewards)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config.schema import LeggedControlConfig, SimConfig
+from legged.config.schema import RobotControlConfig, SimConfig
 from legged.errors import ConfigError
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics
@@ -181,19 +181,19 @@ def test_names_keep_the_order_of_the_model_whatever_the_order_of_the_patterns():
 
 
 def test_gains_come_from_the_task_if_it_names_any_else_from_the_robot(robot):
-    stiffness, damping = control_gains(robot, LeggedControlConfig(stiffness={"HAA": 1.0, "FE": 2.0}))
+    stiffness, damping = control_gains(robot, RobotControlConfig(stiffness={"HAA": 1.0, "FE": 2.0}))
     assert stiffness.tolist() == [1.0, 2.0, 2.0] * 4
     assert damping.tolist() == [4.0] * 12
 
 
 def test_gain_pattern_without_a_joint_is_an_error_that_names_it(robot):
     with pytest.raises(ConfigError, match=r"control\.stiffness: pattern 'HFA' matches nothing \(names: LF_HAA, "):
-        control_gains(robot, LeggedControlConfig(stiffness={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0, "HFA": 80.0}))
+        control_gains(robot, RobotControlConfig(stiffness={"HAA": 80.0, "HFE": 80.0, "KFE": 80.0, "HFA": 80.0}))
 
 
 def test_joint_without_a_gain_is_an_error_that_names_it(robot):
     with pytest.raises(ConfigError, match=r"control\.damping: no pattern matches joint 'LF_KFE'"):
-        control_gains(robot, LeggedControlConfig(damping={"HAA": 2.0, "HFE": 2.0}))
+        control_gains(robot, RobotControlConfig(damping={"HAA": 2.0, "HFE": 2.0}))
 
 
 MOTOR = '<motor name="LF_HAA" joint="LF_HAA"/>'

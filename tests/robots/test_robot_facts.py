@@ -7,7 +7,7 @@ import torch
 from reference import roll
 from robot_facts import FACTS
 
-from legged.config.schema import LeggedControlConfig, SimConfig
+from legged.config.schema import RobotControlConfig, SimConfig
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics
 from legged.robots.patterns import match_values
@@ -91,7 +91,7 @@ def test_left_and_right_are_mirror_images(robot, model):
     partners, signs = list(mirror.joints), np.array(mirror.signs)
     assert [partners[i] for i in partners] == list(range(robot.num_dof))
     np.testing.assert_allclose(robot.default_dof_pos[partners] * signs, robot.default_dof_pos, atol=1e-9)
-    for limit in (robot.torque_limits, robot.dof_vel_limits, *control_gains(robot, LeggedControlConfig())):
+    for limit in (robot.torque_limits, robot.dof_vel_limits, *control_gains(robot, RobotControlConfig())):
         np.testing.assert_array_equal(limit[partners], limit)
     low, high = robot.dof_pos_limits.T
     np.testing.assert_allclose(np.where(signs > 0, low[partners], -high[partners]), low, atol=1e-9)
@@ -127,7 +127,7 @@ def test_standing_robot_keeps_its_height(robot, facts):
     physics.write(torch.ones(1, dtype=torch.bool), start, torch.zeros_like(physics.qvel))
     physics.refresh()
     targets = start[:, list(robot.qpos_columns)]
-    own = facts.gains or map(torch.tensor, control_gains(robot, LeggedControlConfig()))
+    own = facts.gains or map(torch.tensor, control_gains(robot, RobotControlConfig()))
     gains = dict(zip(("stiffness", "damping"), own, strict=True))
     state = physics.robot_state
     if facts.standing is not None:

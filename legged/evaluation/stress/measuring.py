@@ -173,7 +173,7 @@ class Bench:
         commands = torch.where(parts < 0.0, parts * ends[0], parts * ends[1])
         turns = torch.arange(self.robots) % len(COMMANDS)
         own = [
-            *undisturbed(len(per_robot), HOLD_S),
+            *undisturbed(self.cfg, len(per_robot), HOLD_S),
             ("observations.add_noise", self.cfg.observations.add_noise),
             ("terrain.mesh_type", "plane"),
         ]
@@ -196,7 +196,7 @@ class Bench:
     def _run_out(self, rows: Sequence[Disturbance], specs: Sequence[TileSpec], last: Changes = ()) -> tuple[Tensor, Tensor]:
         """Let robots walk out of tiles of all `specs`; return outcomes (N,) and times (N,) [s]. For `last` see `_build`."""
         own = to_run_out(self.cfg, len(rows))
-        cfg: Any = override(self.cfg, [*own, *self.setting.asked, *last])
+        cfg = override(self.cfg, [*own, *self.setting.asked, *last])
         task, act = self._build(rows, own, last, tiles_apart(specs, cfg.terrain, cfg.env.seed))
         scores, lost = run_out(task, act, len(rows) // len(specs))
         self.lost += lost

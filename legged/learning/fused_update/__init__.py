@@ -12,19 +12,16 @@ Operands of products are float16, sums are float32. Gradients are multiplied by 
 """
 
 import importlib.util
-from typing import TYPE_CHECKING
 
 import torch
 
 from legged.learning.closed_form import fits
+from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.estimator import EstimatingModel
 from legged.learning.fused_update.layout import padded
 
-if TYPE_CHECKING:
-    from legged.learning.ppo import DevicePPO
 
-
-def why_not(alg: "DevicePPO") -> str:
+def why_not(alg: CriticWarmup) -> str:
     """Return the reason why the kernels can't compute a learner's updates, or an empty text."""
     rows = 2 * alg.storage.actions[..., 0].numel() // alg.num_mini_batches
     parameters = [parameter for model in (alg.actor, alg.critic) for parameter in model.parameters()]

@@ -3,20 +3,16 @@
 import math
 from collections.abc import Sequence
 from subprocess import CalledProcessError
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 from triton.errors import TritonError
 
 from legged.graph.step_graph import Branch
+from legged.learning.critic_warmup import CriticWarmup
 from legged.learning.fused_update import kernels
 from legged.learning.fused_update.layout import BLOCK, Layout, padded
 from legged.learning.fused_update.network import ROWS, Network, linear_layers
-
-if TYPE_CHECKING:
-    from legged.learning.ppo import DevicePPO
-
 
 FAILURES = (RuntimeError, CalledProcessError, TritonError)
 """Errors of Triton if it finds no C compiler, or if a kernel does not fit the GPU."""
@@ -30,7 +26,7 @@ class FusedUpdate:
     """
 
     def __init__(
-        self, alg: "DevicePPO", rate: Tensor, rates: tuple[float, float, float], kind: torch.dtype = torch.float16
+        self, alg: CriticWarmup, rate: Tensor, rates: tuple[float, float, float], kind: torch.dtype = torch.float16
     ) -> None:
         """Take the learner; its learning `rate` () on the device; the lowest and highest rate, and the factor of an
         adaptation; and the type of the operands of products. All kernels are launched once, on zeros.
@@ -80,7 +76,8 @@ class FusedUpdate:
         """Take a step with parameters that are 0, so that all kernels are compiled. Undo it afterwards."""
         before = self.rate.clone()
         losses = torch.zeros(6, device=self.rate.device)
-        self.learn(0, False, losses)
+        order = torch.rand(self.samples * self.alg.num_mini_batches, device=self.rate.device).argsort()
+        self.learn(order, 0, False, losses)
         self._step(0, torch.zeros(self.samples, dtype=torch.int64, device=self.rate.device), False, losses)
         self.rate.copy_(before)
         for tensor in (self.vector, self.first, self.second, self.steps):
@@ -127,11 +124,12 @@ class FusedUpdate:
         return (rows.abs() - 1.0).clamp(min=0.0).int(), rows.sign()
 
     @torch.no_grad()
-    def learn(self, epochs: int, critic_alone: bool, losses: Tensor) -> None:
-        """Learn from the stored rollout for a number of epochs, and add the losses of the mini-batches to `losses` (K,)."""
+    def learn(self, order: Tensor, epochs: int, critic_alone: bool, losses: Tensor) -> None:
+        """Learn from the stored rollout for a number of epochs, and add the losses of the mini-batches to `losses` (K,).
+        Mini-batches take the samples in the `order` (S,), a permutation.
+        """
         st = self.alg.storage
         batches = self.alg.num_mini_batches
-        order = self.alg._order(self.samples * batches)
         self._bound_std()
         self.shadow.copy_(self.vector)
         self.largest.zero_()

@@ -11,7 +11,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.color import srgb_to_linear
 from trimesh.visual.material import PBRMaterial
 
-from legged.envs import LeggedRobot, RobotTask
+from legged.envs import is_robot_task, is_velocity_task
 from legged.math import yaw_of
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
@@ -89,7 +89,7 @@ class Drawing:
         self._task = task = self.session.task
         terrain = getattr(task, "terrain", None)
         robots = range(task.num_envs)
-        if isinstance(task, RobotTask):
+        if is_robot_task(task):
             model, sides = robot_spec_of(task.robot.model_path, drawn=True).compile(), camera.size_of(task.robot)
             columns = int(np.ceil(task.num_envs**0.5))
         else:
@@ -111,7 +111,7 @@ class Drawing:
             for robot in robots
         ]
         self._above, self._arrows = [], []
-        if isinstance(task, LeggedRobot):  # each robot has arrows in a frame above it, which turns with its heading
+        if is_velocity_task(task):  # each robot has arrows in a frame above it, which turns with its heading
             thick, nothing = 0.022 * self.length, np.full((2, 2, 3), HIDDEN, dtype=np.float32)
             heads = {"shaft_radius": thick, "head_radius": 2.2 * thick, "head_length": 4.0 * thick}
             colors = np.array([_light(COMMANDED), _light(ACTUAL)], dtype=np.uint8)

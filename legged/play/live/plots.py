@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legged.envs import BaseTask, LeggedRobot
+from legged.envs import BaseTask, is_robot_task, is_velocity_task
 from legged.figures import COLORS, without_common_words
 from legged.policies.episodes import unit_of
 
@@ -39,7 +39,7 @@ class History:
 
     def __init__(self, task: BaseTask) -> None:
         self.terms = task.rewards.names
-        self.feet = task.robot.feet_names if isinstance(task, LeggedRobot) else ()
+        self.feet = task.robot.feet_names if is_robot_task(task) else ()
         self.per_second = task.cfg.rewards.times_dt
         """True: rewards are per second. False: rewards are per step."""
         self.dt = task.dt
@@ -51,13 +51,14 @@ class History:
         row = np.full(7 + len(self.feet) + len(self.terms), np.nan)
         row[0] = time
         if not bool(task.reset_buf[robot]):
-            if isinstance(task, LeggedRobot):
+            if is_robot_task(task):
                 row[1:3] = task.base_lin_vel[robot, :2].tolist()
                 row[3] = float(task.base_ang_vel[robot, 2])
-                row[4:7] = task.commands[robot, :3].tolist()
                 row[7 : 7 + len(self.feet)] = task.contacts.in_contact[robot].tolist()
             else:
                 row[1] = float(task.physics.qvel[robot, 0])
+            if is_velocity_task(task):
+                row[4:7] = task.commands[robot, :3].tolist()
             row[7 + len(self.feet) :] = (task.rewards.last[:, robot] / unit_of(task)).tolist()
         self.rows.append(row)
 

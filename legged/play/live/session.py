@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged.config import LeggedConfig, TaskConfig
-from legged.envs import LeggedRobot
+from legged.config import TaskConfig, follows_velocities, has_robot
+from legged.envs import is_velocity_task
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
 from legged.learning.run_folder import BEST, BEST_MODEL, checkpoints, find_checkpoint, newest_run, run_config, run_named
@@ -107,7 +107,7 @@ def grounds_of(cfg: TaskConfig) -> list[str]:
     """Return the kinds of ground that can be chosen, the task's own first. There is only one if the model has its own floor
     or the task's terrain is a single tile.
     """
-    if not isinstance(cfg, LeggedConfig):
+    if not has_robot(cfg):
         return [OWN]
     on_plane = cfg.terrain.mesh_type == "plane"
     if not on_plane and cfg.terrain.num_rows * cfg.terrain.num_cols == 1:
@@ -122,7 +122,7 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
         ConfigError: the type or the difficulty does not exist, or the task has a single ground.
     """
     kinds = grounds_of(cfg)
-    if isinstance(cfg, LeggedConfig) and len(kinds) > 1:
+    if len(kinds) > 1 or not has_robot(cfg):
         Playground.of(cfg, kind, difficulty)
         return kinds[0] if kind is None else kind
     for flag, given in (("terrain", kind), ("difficulty", difficulty)):
@@ -133,11 +133,9 @@ def check_ground(cfg: TaskConfig, kind: str | None, difficulty: float | None) ->
 
 def changes_for(cfg: TaskConfig, num_envs: int, asked: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
     """Return overrides for `num_envs` undisturbed robots; the overrides in `asked` may disturb them."""
-    if isinstance(cfg, LeggedConfig):
-        keep_length = len(grounds_of(cfg)) == 1  # the task's own length ends episodes before robots reach a tile's edge
-        seconds = cfg.env.episode_length_s - 10.0 if keep_length else HOURS_S
-        return [*undisturbed(num_envs, seconds), *asked, ("env.num_envs", num_envs)]
-    return [("observations.add_noise", False), *asked, ("env.num_envs", num_envs)]
+    # On the only ground, the task's own length ends episodes before robots reach a tile's edge.
+    seconds = HOURS_S if follows_velocities(cfg) and len(grounds_of(cfg)) > 1 else None
+    return [*undisturbed(cfg, num_envs, seconds), *asked, ("env.num_envs", num_envs)]
 
 
 class Session:
@@ -318,9 +316,9 @@ class Session:
         cfg = nominal(self.watched.cfg, self.changes)
         playground: Playground | None = None
         terrain: Terrain | None = None
-        if isinstance(cfg, LeggedConfig) and kind != PLANE and len(self.grounds) > 1:
+        if kind != PLANE and len(self.grounds) > 1:
             playground = Playground.of(cfg, None if kind == OWN else kind, difficulty)
-        if isinstance(cfg, LeggedConfig) and playground is not None:
+        if has_robot(cfg) and playground is not None:
             setting: list[tuple[str, Any]] = [*SETTING]
             if cfg.env.num_envs > len(playground.order):
                 side = min(cfg.terrain.terrain_length, cfg.terrain.terrain_width)
@@ -330,7 +328,7 @@ class Session:
         self.task: Any = make_task(cfg, self.device, self._graph, terrain)
         self.can_be_pushed = self.task.physics.model.jnt_type[:1].tolist() == [FREE_JOINT]
         """True if the base floats, because only floating bases can be pushed."""
-        self.has_commands = isinstance(self.task, LeggedRobot)
+        self.has_commands = is_velocity_task(self.task)
         self.ranges: list[list[float]] = self.task.command_sampler.full_ranges.tolist() if self.has_commands else []
         """Ranges of vx, vy [m/s] and yaw rate [rad/s] in training; empty for tasks without commands."""
         self.playground, self.kind, self.difficulty = playground, kind, difficulty

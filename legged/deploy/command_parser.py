@@ -3,20 +3,17 @@
 import argparse
 import math
 import re
-import sys
 import textwrap
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn
 
-from legged.errors import ConfigError, suggest
+from legged.deploy.errors import ConfigError, suggest
 
 Argument = Callable[[argparse.ArgumentParser], object]
 """A function that adds an argument to a parser."""
 
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 """Pattern of negative numbers, which look like options. Before Python 3.14 argparse takes -1e-1 for an option."""
-OF_LEGGED_GYM = re.compile(r"--(num_envs|load_run|experiment_name|run_name|max_iterations|sim_device|rl_device)(?==|$)")
-"""Pattern of options that exist in legged_gym too. They may be written with underscores, as in legged_gym."""
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -32,12 +29,6 @@ class CommandParser(argparse.ArgumentParser):
         for add in arguments:
             add(self)
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Parse as argparse does, after replacing underscores in legged_gym's options by hyphens."""
-        words = sys.argv[1:] if args is None else args
-        hyphened = [OF_LEGGED_GYM.sub(lambda option: option[0].replace("_", "-"), word) for word in words]
-        return super().parse_known_args(hyphened, namespace)
-
     def error(self, message: str) -> NoReturn:
         """End the program with exit code 2. For an unknown option, suggest the nearest one."""
         unknown = re.search(r"unrecognized arguments: (?:.* )?(--[\w-]+)", message)
@@ -46,28 +37,9 @@ class CommandParser(argparse.ArgumentParser):
         super().error(message)
 
 
-class Once(argparse.Action):
-    """Option that may be given once. If it were given twice, argparse would silently use the last value."""
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: Any = None
-    ) -> None:
-        """Store the value, or end the program if the option was given before."""
-        before = getattr(namespace, self.dest)
-        if before is not None:
-            parser.error(f"{option}: is given twice, {before} and {values}; write {option} {before},{values}")
-        setattr(namespace, self.dest, values)
-
-
 def argument(*names: str, **options: Any) -> Argument:
     """Return an argument. Names and options are those of argparse's `add_argument`."""
     return lambda parser: parser.add_argument(*names, **options)
-
-
-IMPORT = argument(
-    "--import", dest="module", action=Once, help="module, .py or YAML file with user-defined tasks; join several by commas"
-)
-"""The option `--import`, for files and modules with user-defined tasks. `args.module` holds its value."""
 
 
 def check_number(flag: str, value: float | None, least: float, most: float = math.inf, above: bool = False) -> None:
