@@ -14,7 +14,7 @@ from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms
 from legged.math import evenly_spaced, quat_rotate
-from legged.mdp.actuator import with_rotors
+from legged.mdp.actuators.motor_curve import with_rotors
 from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
 from legged.mdp.disturbances import Disturbances
@@ -305,5 +305,5 @@ class RobotTask(RobotTerms, BaseTask):
         if self.disturbances.STATE:
             parts["disturbances"] = self.disturbances
         if self.control.actuator is not None:
-            parts["actuator"] = self.control.actuator
+            parts |= self.control.actuator.parts()
         return parts

@@ -236,7 +236,7 @@ class StressedTask(LeggedRobot):
         )
         points = self.measured_heights.shape[1]
         self._map_holes = 0.5 * (draw(points) + 1.0) < self._per_robot("map_holes").unsqueeze(1)
-        if self.control.actuator is not None and self.control.actuator.longest:
+        if self.control.actuator is not None and self.control.actuator.line.longest:
             steps = (self._per_robot("delay") / self.cfg.sim.dt).round()
             low, high = self.own_delay
             own = (low + 0.5 * (draw() + 1.0) * (high + 1 - low)).floor().clamp_(max=high)
