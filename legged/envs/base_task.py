@@ -26,6 +26,7 @@ from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
 from legged.mdp.height_map_errors import HeightMapErrors
+from legged.mdp.kernels import name_module, task_kernels
 from legged.mdp.metrics import Metrics
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.nan_guard import LARGEST_STATE, NanGuard
@@ -88,7 +89,8 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._init_buffers()
         if not self._has_buffers:
             raise ConfigError(f"{type(self).__name__}._init_buffers must call super()._init_buffers()")
-        self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
+        steps = cfg.train.runner.num_steps_per_env
+        self.randomization.prepare(self.physics, self.numbers, self.dt, steps, self.kernels)
         self._collect_terms()
         self.numbers.allocate()
         # On a GPU, the step runs eagerly if the engine can't be captured. On the CPU, `_build_graph` only checks the step.
@@ -130,8 +132,10 @@ class BaseTask(PrivilegedTerms, VecEnv):
         cfg, where = self.cfg, self.cfg.origins.where
         fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, where)
-        others = (self.QUANTITIES, where, self.pushed_by_forces())
+        others = (self.QUANTITIES, where, self.pushed_by_forces(), (name_module,))
         self.physics = make_physics(scene, cfg.sim, self.num_envs, self.device, fields, *others)
+        self.kernels = task_kernels(self.physics)
+        """Warp kernels that replace torch operations in parts of the step; None if the engine does not use Warp."""
         stage_ended("physics built")
         self.field_rows = row_counts(scene, self.physics.model)
         for name, draw in self.randomization.draws.items():
@@ -219,7 +223,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         scales = {name: scale for name, scale in cfg.scales.items() if scale != 0.0}
         unit = self.dt if cfg.times_dt else 1.0
         rewards = self._concurrent_rewards.add("_reward_", self._methods("_reward_", scales))
-        self.rewards = Rewards(rewards, scales, unit, cfg.only_positive_rewards, self.rew_buf, self.physics.kernels)
+        self.rewards = Rewards(rewards, scales, unit, cfg.only_positive_rewards, self.rew_buf, self.kernels)
         self.episode_sums = self.rewards.episode_sums
         names = sorted(self.terms("_metric_"))
         metrics = self._concurrent_metrics.add("_metric_", self._methods("_metric_", names))

@@ -26,7 +26,7 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     def _init_buffers(self) -> None:
         """Allocate tensors and parts for the robot, its commands, its ground and the curricula."""
         super()._init_buffers()
-        cfg, kernels = self.cfg, self.physics.kernels
+        cfg, kernels = self.cfg, self.kernels
         default, last = self.default_dof_pos, self.last_actions
         self.default_dof_pos = Wide.of(default, lambda: default.unsqueeze(0))
         self.last_actions = Wide.of(last, lambda: torch.stack([last, self.last_last_actions], dim=2))
@@ -40,7 +40,7 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
             self.env_origins = self.terrain_curriculum.origins
 
     def make_commands(self) -> None:
-        sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.physics.kernels, self.numbers)
+        sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.kernels, self.numbers)
         self.command_sampler, self.commands, self.is_moving = sampler, sampler.commands, sampler.is_moving
 
     def observation_scales(self) -> dict[str, Any]:

@@ -93,7 +93,7 @@ class RobotTask(RobotTerms, BaseTask):
         """Allocate tensors and parts for the robot, its commands and its ground."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
-        kernels = self.physics.kernels
+        kernels = self.kernels
         state = self.physics.robot_state
         assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
@@ -106,7 +106,7 @@ class RobotTask(RobotTerms, BaseTask):
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
         steps = cfg.train.runner.num_steps_per_env
-        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
+        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers, kernels)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
         self._vary_control()
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
@@ -183,7 +183,7 @@ class RobotTask(RobotTerms, BaseTask):
         cfg = self.cfg.observations.height_map
         if is_exact(cfg):
             return None
-        scan, kernels, pose = self.height_scan, self.physics.kernels, (self.base_pos, self.base_quat)
+        scan, kernels, pose = self.height_scan, self.kernels, (self.base_pos, self.base_quat)
         if cfg.shift or cfg.shift_drift:
             scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, kernels)  # type: ignore[arg-type]
         return HeightMapErrors(cfg, scan, pose, self.heights_seen, self.dt, self.numbers, kernels)

@@ -18,7 +18,7 @@ from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 class Control:

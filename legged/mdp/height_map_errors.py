@@ -12,7 +12,7 @@ from legged.mdp.height_scan import HeightScan
 from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 def is_exact(cfg: HeightMapConfig) -> bool:

@@ -10,7 +10,7 @@ from legged.math import yaw_of
 from legged.terrain.terrain import Terrain
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 class HeightScan:

@@ -18,8 +18,8 @@ from legged.mdp.actuators.friction import Friction
 from legged.mdp.actuators.motor_curve import MotorCurve, check_motor_model
 from legged.mdp.actuators.network import NetworkWeights
 from legged.mdp.control import Control
+from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
-from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 
 N, D, DT = 8, 12, 0.005

@@ -249,7 +249,7 @@ class StressedTask(LeggedRobot):
             return None
         scan = self.height_scan
         if cfg.shift:
-            scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.physics.kernels)
+            scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.kernels)
         pose, numbers = (self.base_pos, self.base_quat), RandomPool(n, torch.device(self.device))
         found = GivenMap(cfg, scan, pose, self.heights_seen, self.dt, numbers)
         found.given = self._map_error, self._map_holes

@@ -17,7 +17,7 @@ from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 MODELS = "control.actuator.models"
 """Setting that selects user-defined models."""

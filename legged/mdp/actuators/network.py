@@ -19,7 +19,7 @@ from legged.math import masked_set_
 from legged.mdp.actuators.model import ActuatorModel, JointStep, Motors, modelled_joints
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 KINDS = ("mlp", "lstm")
 FORMAT = 1

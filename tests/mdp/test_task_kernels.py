@@ -24,11 +24,11 @@ from legged.mdp.distributions import Distributions
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.height_scan import HeightScan
+from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 from legged.state import state_of
 from legged.terrain import Terrain
@@ -208,8 +208,8 @@ def varying(*names, when="interval"):
 class NoPhysics:
     """What the parts below ask of an engine."""
 
-    def __init__(self, kernels) -> None:
-        self.kernels, self.forces, self.pushed = kernels, torch.zeros(N, 3, 6), torch.zeros(N, 6)
+    def __init__(self) -> None:
+        self.forces, self.pushed = torch.zeros(N, 3, 6), torch.zeros(N, 6)
         self.model = SimpleNamespace(jnt_bodyid=[1])
 
     def push(self, mask, delta):
@@ -229,10 +229,10 @@ def test_numbers_are_drawn_again_alike(chosen):
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(RandomPool(N, CPU))
-        engines.append(NoPhysics(kernels))
+        engines.append(NoPhysics())
         parts.append(Randomization(ranges, N, CPU))
         parts[-1].widen(dict.fromkeys(ranges, 3))
-        parts[-1].prepare(engines[-1], numbers[-1], DT, 24)
+        parts[-1].prepare(engines[-1], numbers[-1], DT, 24, kernels)
     for step in range(20):
         reset = chance(0.1, N)
         for part, drawn, engine in zip(parts, numbers, engines, strict=True):
@@ -296,8 +296,8 @@ def test_kicks_and_forces_come_and_end_alike(of):
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(RandomPool(N, CPU))
-        engines.append(NoPhysics(kernels))
-        parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1]))
+        engines.append(NoPhysics())
+        parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1], kernels))
     kicked = 0
     for step in range(40):
         mask = chance(0.9, N)
