@@ -16,17 +16,24 @@ def _w_first(quat: Tensor) -> Tensor:
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate vectors `vec` (N, 3) from the body frame of `quat` (N, 4) to the world frame."""
-    w, xyz = _w_first(quat).split([1, 3], dim=1)
+    """Rotate vectors `vec` (..., 3) from the body frame of `quat` (..., 4) to the world frame."""
+    w, xyz = _w_first(quat).split([1, 3], dim=-1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate vectors `vec` (N, 3) from the world frame to the body frame of `quat` (N, 4)."""
-    w, xyz = _w_first(quat).split([1, 3], dim=1)
+    """Rotate vectors `vec` (..., 3) from the world frame to the body frame of `quat` (..., 4)."""
+    w, xyz = _w_first(quat).split([1, 3], dim=-1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Return the products (..., 4) of quaternions `a` and `b` (..., 4): the turn `b`, then the turn `a`."""
+    (aw, a_xyz), (bw, b_xyz) = (_w_first(each).split([1, 3], dim=-1) for each in (a, b))
+    w = aw * bw - (a_xyz * b_xyz).sum(dim=-1, keepdim=True)
+    return torch.cat([w, aw * b_xyz + bw * a_xyz + torch.linalg.cross(a_xyz, b_xyz)], dim=-1)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:

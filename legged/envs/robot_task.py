@@ -19,9 +19,9 @@ from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
+from legged.mdp.sensors import HeightScan, Sensor
 from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
@@ -78,6 +78,13 @@ class RobotTask(RobotTerms, BaseTask):
         self.terrain = self.terrain or self.make_terrain()
         return RobotScene(self.robot, self.terrain)
 
+    def make_sensors(self) -> dict[str, Sensor]:
+        """Return the height scan. A subclass may add sensors."""
+        state = self.physics.robot_state
+        assert state is not None
+        self.height_scan = HeightScan(self.cfg.terrain, self.terrain, (state.base_pos, state.base_quat), self.kernels)
+        return {**super().make_sensors(), "height_scan": self.height_scan}
+
     def make_terrain(self) -> Terrain | None:
         """Hook: return the configured terrain; None for a plane. A subclass may return another terrain."""
         cfg = self.cfg.terrain
@@ -126,7 +133,6 @@ class RobotTask(RobotTerms, BaseTask):
         self.dof_pos_limits = self._soft_limits(robot)
         self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
-        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.env_origins = torch.zeros(n, 3, device=device)
         """(N, 3) middle of the area in which each robot's episodes begin, world frame [m]."""
@@ -185,7 +191,7 @@ class RobotTask(RobotTerms, BaseTask):
             return None
         scan, kernels, pose = self.height_scan, self.kernels, (self.base_pos, self.base_quat)
         if cfg.shift or cfg.shift_drift:
-            scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, kernels)  # type: ignore[arg-type]
+            scan = HeightScan(self.cfg.terrain, self.terrain, pose, kernels)
         return HeightMapErrors(cfg, scan, pose, self.heights_seen, self.dt, self.numbers, kernels)
 
     def mirror_images(self) -> MirrorImages | None:
@@ -222,10 +228,6 @@ class RobotTask(RobotTerms, BaseTask):
             torch.sin(half_yaw, out=self.reset_qpos[:, 6])
             # In MuJoCo the linear velocity of a floating base is in the world frame, the angular velocity in the base frame.
             self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity.values[:, :3]))
-
-    def sense(self) -> None:
-        super().sense()
-        self.height_scan.update(self.base_pos, self.base_quat)
 
     def advance(self) -> None:
         super().advance()
@@ -299,7 +301,6 @@ class RobotTask(RobotTerms, BaseTask):
             **super().parts(),
             "contacts": self.contacts,
             "control": self.control,
-            "height_scan": self.height_scan,
             "pushes": self.pushes,
         }
         if self.disturbances.STATE:

@@ -23,11 +23,11 @@ from legged.mdp.control import Control
 from legged.mdp.distributions import Distributions
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
+from legged.mdp.sensors import HeightScan
 from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.robots.robot import load_robot
 from legged.state import state_of
@@ -128,11 +128,11 @@ def ground() -> Terrain:
 @pytest.mark.parametrize("scan", ["lowest", "own", "highest"])
 def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere(scan):
     terrain = ground()
-    parts = pair(lambda kernels: HeightScan(TerrainConfig(scan=scan), terrain, N, CPU, kernels))
-    base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+    pose = base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+    parts = pair(lambda kernels: HeightScan(TerrainConfig(scan=scan), terrain, pose, kernels))
     base_pos[1, 0], base_pos[2, 1], base_quat[3] = torch.nan, torch.inf, torch.nan
     for part in parts:
-        part.update(base_pos, base_quat)
+        part.update()
     # Where a point lies on the border of two cells, sines of two libraries may put it into either.
     same = torch.cat([parts[0].heights == parts[1].heights, (parts[0].ground == parts[1].ground).unsqueeze(1)], dim=1)
     assert same.float().mean() > 0.999
@@ -336,7 +336,7 @@ def test_maps_go_wrong_alike(errors):
     for kernels in (None, TaskKernels(nullcontext)):
         numbers.append(RandomPool(N, CPU))
         pose = (torch.zeros(N, 3), torch.zeros(N, 4))
-        scan = HeightScan(cfg, None, N, CPU, kernels)
+        scan = HeightScan(cfg, None, pose, kernels)
         maps.append(HeightMapErrors(HeightMapConfig(**errors), scan, pose, torch.neg, DT, numbers[-1], kernels))
     for step in range(5):
         begun = chance(1.0 if step == 0 else 0.3, N)

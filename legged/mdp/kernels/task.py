@@ -8,6 +8,7 @@ import warp as wp
 from torch import Tensor
 
 from legged.mdp.kernels.actuator import drive_joints
+from legged.mdp.kernels.bodies import read_bodies
 from legged.mdp.kernels.network import run_lstm, run_mlp
 from legged.mdp.kernels.random import (
     advance_map,
@@ -396,6 +397,10 @@ class TaskKernels(Launcher):
         """Launch the kernel of `HeightScan.update`."""
         dim = (len(base_pos), len(points_x))
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
+
+    def read_bodies(self, pos: Tensor, *arguments: Tensor) -> None:
+        """Launch the kernel of `BodyStates.update`. The first six arguments are vectors."""
+        self.launch(read_bodies, tuple(pos.shape[:2]), (pos, *arguments), vectors=6)
 
     def move_levels(self, *arguments: Tensor | float) -> None:
         """Launch the kernel of `TerrainCurriculum.update`. The caller sums the last argument (`judged`) over robots."""
