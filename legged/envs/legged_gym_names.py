@@ -15,8 +15,15 @@ from torch import Tensor
 
 from legged.envs.class_checks import names_in
 from legged.envs.views import ReadOnly
+from legged.graph import guard
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
 from legged.robots.stance import lowest_point, stance
+
+guard.HINTS |= {
+    r"\bcommands\[:, ?([4-9]|\d\d)\b": "self.commands (N, 4) has vx, vy, yaw rate, heading; keep others in your own tensor",
+    r"\.terrain_heights\(": "self.height_scan.ground_at(points) has heights of the ground; self.base_height is above it",
+    r"\bquat_(conjugate|mul)\(": "legged.math has quat_multiply, w first; quat_rotate_inverse turns by the conjugate",
+}
 
 
 def _root_states(task: Any) -> Tensor:

@@ -1,7 +1,7 @@
 """Interface of actuator models, and the registry of user-defined ones."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
@@ -55,6 +55,8 @@ class Motors:
     kernels: "TaskKernels | None" = None
     origins: Origins | None = None
     """Sources of the settings, for error messages."""
+    path: str = "control.actuator"
+    """Dotted path of the model's settings."""
 
     def where(self, path: str) -> str:
         """Return the beginning of an error message about the setting at a dotted path."""
@@ -68,15 +70,15 @@ class Motors:
         """Return an array as a float32 tensor on the motors' device."""
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
-    def each(self, table: Mapping[str, float], path: str, otherwise: float = 0.0) -> Tensor:
+    def each(self, table: Mapping[str, float], setting: str, otherwise: float = 0.0) -> Tensor:
         """Return a number for each joint, (D,), from joint-name patterns. The longest pattern in a joint's name decides, and
-        `otherwise` is the number of joints whose names contain no pattern. `path` is the setting's dotted path.
+        `otherwise` is the number of joints whose names contain no pattern. `setting` is the name of the model's setting.
 
         Raises:
             ConfigError: a pattern matches no joint.
         """
         fallback = np.full(self.robot.num_dof, otherwise)
-        return self.tensor(by_joint(table, self.robot, self.where(path), fallback))
+        return self.tensor(by_joint(table, self.robot, self.where(f"{self.path}.{setting}"), fallback))
 
 
 class ActuatorModel:
@@ -153,7 +155,7 @@ def registered_models(motors: Motors) -> dict[str, ActuatorModel]:
                 " registers it"
             )
         settings: Any = build(_REGISTERED[name].Settings, given, path, motors.origins or Origins(), "control")
-        made[name] = _REGISTERED[name](settings, motors)  # type: ignore[call-arg]
+        made[name] = _REGISTERED[name](settings, replace(motors, path=path))  # type: ignore[call-arg]
     return made
 
 
