@@ -16,17 +16,24 @@ def _w_first(quat: Tensor) -> Tensor:
 
 
 def quat_rotate(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate vectors `vec` (N, 3) from the body frame of `quat` (N, 4) to the world frame."""
-    w, xyz = _w_first(quat).split([1, 3], dim=1)
+    """Rotate vectors `vec` (..., 3) from the body frame of `quat` (..., 4) to the world frame."""
+    w, xyz = _w_first(quat).split([1, 3], dim=-1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec + w * t + torch.linalg.cross(xyz, t)
 
 
 def quat_rotate_inverse(quat: Tensor, vec: Tensor) -> Tensor:
-    """Rotate vectors `vec` (N, 3) from the world frame to the body frame of `quat` (N, 4)."""
-    w, xyz = _w_first(quat).split([1, 3], dim=1)
+    """Rotate vectors `vec` (..., 3) from the world frame to the body frame of `quat` (..., 4)."""
+    w, xyz = _w_first(quat).split([1, 3], dim=-1)
     t = 2.0 * torch.linalg.cross(xyz, vec)
     return vec - w * t + torch.linalg.cross(xyz, t)
+
+
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Return the products (..., 4) of quaternions `a` and `b` (..., 4): the turn `b`, then the turn `a`."""
+    (aw, a_xyz), (bw, b_xyz) = (_w_first(each).split([1, 3], dim=-1) for each in (a, b))
+    w = aw * bw - (a_xyz * b_xyz).sum(dim=-1, keepdim=True)
+    return torch.cat([w, aw * b_xyz + bw * a_xyz + torch.linalg.cross(a_xyz, b_xyz)], dim=-1)
 
 
 def quat_to_matrix(quat: Tensor) -> Tensor:
@@ -89,13 +96,6 @@ def rotation_vector(quat: Tensor) -> Tensor:
 def quat_conjugate(quat: Tensor) -> Tensor:
     """Return the inverse rotations (..., 4) of unit quaternions `quat` (..., 4), w first."""
     return torch.cat([_w_first(quat)[..., :1], -quat[..., 1:]], dim=-1)
-
-
-def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
-    """Return the products (..., 4) of quaternions, w first: the turn `b`, followed by the turn `a`."""
-    aw, av, bw, bv = _w_first(a)[..., :1], a[..., 1:], _w_first(b)[..., :1], b[..., 1:]
-    w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
-    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av, bv)], dim=-1)
 
 
 def wrap_to_pi(angle: Tensor) -> Tensor:

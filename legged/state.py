@@ -1,6 +1,6 @@
 """Saving and loading of an object's state. The state consists of the tensors that are listed in `STATE` of the class."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from torch import Tensor
@@ -44,3 +44,9 @@ def take(tensors: Mapping[str, Tensor], saved: Mapping[str, Any], of: str) -> No
 def tensors_of(owner: Any) -> dict[str, Tensor]:
     """Return the attributes of an object that are tensors, by name. None has no attributes."""
     return {} if owner is None else {name: value for name, value in vars(owner).items() if isinstance(value, Tensor)}
+
+
+def without_memory_of(others: Iterable[Tensor], tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the `tensors` that share no memory with any of the `others`."""
+    known = {tensor.untyped_storage().data_ptr() for tensor in others}
+    return {name: tensor for name, tensor in tensors.items() if tensor.untyped_storage().data_ptr() not in known}

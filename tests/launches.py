@@ -13,7 +13,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from legged.physics.warp.launcher import Launcher
 
 NO_LAUNCH = ("detach", "empty", "empty_strided", "empty_like", "new_empty", "lift_fresh", "alias", "_unsafe_view")
-OURS = (*(f"legged.physics.warp.{of}_kernels" for of in ("task", "actuator", "network", "random")), "add_velocities")
+OURS = (*(f"legged.mdp.kernels.{of}" for of in ("task", "actuator", "network", "random")), "add_velocities")
 """Kernels that stand for torch's launches: their module, or their name."""
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
+from legged.process.command_parser import CommandParser
 
 from legged.commandline.command import run_main
 from legged.episodes.recorder import Wish, roll_out
@@ -20,7 +21,6 @@ from legged.motion.checks import quality_of
 from legged.motion.clip import Clip, make_clip, write_clip
 from legged.motion.kinematics import Skeleton
 from legged.policies.restore import policy_of
-from legged.process.command_parser import CommandParser
 from legged.process.paths import relative
 from legged.robots.robot import load_robot
 

@@ -21,7 +21,7 @@ from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
-from legged.mdp.actuator import with_rotors
+from legged.mdp.actuators.motor_curve import with_rotors
 from legged.play.films import write_mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed

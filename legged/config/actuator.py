@@ -1,7 +1,7 @@
 """Settings of real motors: speed-dependent torque limits, friction, delay, and learned actuators."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from legged.config.bounds import LARGEST, TERMS, between, positive, quantity
 
@@ -51,3 +51,6 @@ class ActuatorConfig:
     network: str = ""
     """File of a learned actuator (`legged fit-actuator`), relative to the configuration file. The network in this file
     computes the torque from target, angle and velocity, in place of the P law."""
+    models: dict[str, Any] = field(default_factory=dict)
+    """User-defined model (`register_actuator`) -> its settings; null switches an inherited model off. The models follow the
+    built-in ones, in this order."""

@@ -25,6 +25,7 @@ from legged.errors import ConfigError
 from legged.graph.step_graph import Branch, StepGraph
 from legged.math import masked_set_
 from legged.mdp.height_map_errors import HeightMapErrors
+from legged.mdp.kernels import name_module, task_kernels
 from legged.mdp.metrics import Metrics
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.nan_guard import LARGEST_STATE, NanGuard
@@ -33,11 +34,12 @@ from legged.mdp.observations import ObservationGroup, ObservationTerms
 from legged.mdp.random_pool import RandomPool, seed_host
 from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
+from legged.mdp.sensors import Sensor
 from legged.mdp.terminations import Terminations
 from legged.physics import MODEL_FIELDS, Scene, check_ranges, make_physics, row_counts
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
-from legged.state import load_state, state_of, take, tensors_of
+from legged.state import load_state, state_of, take, tensors_of, without_memory_of
 
 REWARD_STREAMS = 5
 """Number of streams that concurrent rewards are distributed over. On an H100, the rewards of an ANYmal take 49 us on 5
@@ -87,7 +89,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._init_buffers()
         if not self._has_buffers:
             raise ConfigError(f"{type(self).__name__}._init_buffers must call super()._init_buffers()")
-        self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env)
+        self.randomization.prepare(self.physics, self.numbers, self.dt, cfg.train.runner.num_steps_per_env, self.kernels)
         self._collect_terms()
         self.numbers.allocate()
         # On a GPU, the step runs eagerly if the engine can't be captured. On the CPU, `_build_graph` only checks the step.
@@ -115,6 +117,12 @@ class BaseTask(PrivilegedTerms, VecEnv):
         """Return the randomised properties, drawn for every environment."""
         return Randomization(self.cfg.domain_rand.ranges, self.num_envs, self.device)
 
+    def make_sensors(self) -> dict[str, Sensor]:
+        """Hook: return name -> sensor that `sense` updates. Terms read `self.sensors[name]`. The scene, `self.physics` and
+        `self.kernels` exist by then. A subclass extends the result of super().make_sensors().
+        """
+        return {}
+
     def pushed_by_forces(self) -> bool:
         """Return True if external forces act on bodies (`physics.forces`)."""
         return False
@@ -129,8 +137,10 @@ class BaseTask(PrivilegedTerms, VecEnv):
         cfg, where = self.cfg, self.cfg.origins.where
         fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, where)
-        others = (self.QUANTITIES, where, self.pushed_by_forces())
+        others = (self.QUANTITIES, where, self.pushed_by_forces(), (name_module,))
         self.physics = make_physics(scene, cfg.sim, self.num_envs, self.device, fields, *others)
+        self.kernels = task_kernels(self.physics)
+        """Warp kernels that replace torch operations in parts of the step; None if the engine does not use Warp."""
         stage_ended("physics built")
         self.field_rows = row_counts(scene, self.physics.model)
         for name, draw in self.randomization.draws.items():
@@ -176,6 +186,8 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._clipped_actions = torch.zeros_like(self.actions)
         self._in_bounds = torch.ones_like(self.valid)
         self._stream_1, self._stream_2 = Branch(device), Branch(device)  # type: ignore[arg-type]
+        self.sensors = self.make_sensors()
+        """Sensors by name."""
         self.numbers = RandomPool(n, device)  # type: ignore[arg-type]
         """Pool of the random numbers of a step. Subclasses reserve columns in `_init_buffers`."""
         self.step_watcher: Callable[[], None] | None = None
@@ -218,7 +230,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         scales = {name: scale for name, scale in cfg.scales.items() if scale != 0.0}
         unit = self.dt if cfg.times_dt else 1.0
         rewards = self._concurrent_rewards.add("_reward_", self._methods("_reward_", scales))
-        self.rewards = Rewards(rewards, scales, unit, cfg.only_positive_rewards, self.rew_buf, self.physics.kernels)
+        self.rewards = Rewards(rewards, scales, unit, cfg.only_positive_rewards, self.rew_buf, self.kernels)
         self.episode_sums = self.rewards.episode_sums
         names = sorted(self.terms("_metric_"))
         metrics = self._concurrent_metrics.add("_metric_", self._methods("_metric_", names))
@@ -308,7 +320,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         self._concurrent_metrics.start()
         self.check_termination()
         if type(self).check_termination is not BaseTask.check_termination:
-            self._settle_endings()
+            self.terminations.settle()
         with self._stream_2.fork():
             self.measure()
         self.compute_reward()
@@ -365,6 +377,8 @@ class BaseTask(PrivilegedTerms, VecEnv):
     def sense(self) -> None:
         """Hook: update all tensors that are computed from the state of the physics."""
         self.physics.refresh()
+        for sensor in self.sensors.values():
+            sensor.update()
 
     def advance(self) -> None:
         """Hook: advance counters of time, such as `episode_length_buf`, by a control step."""
@@ -379,13 +393,6 @@ class BaseTask(PrivilegedTerms, VecEnv):
         torch.logical_and(self._in_bounds, self.nan_guard.outputs_finite, out=self.valid)
         self._concurrent_terminations.join()
         self.terminations.evaluate(self.valid, self.episode_length_buf >= self.max_episode_length)
-
-    def _settle_endings(self) -> None:
-        """Make `time_out_buf` and `terminated_buf` agree with `reset_buf`. This is necessary if an override of
-        `check_termination` writes only `reset_buf`, as in legged_gym. An episode that ends without a time-out has failed.
-        """
-        self.time_out_buf.logical_and_(self.reset_buf)
-        torch.gt(self.reset_buf, self.time_out_buf, out=self.terminated_buf)
 
     @concurrent
     def measure(self) -> None:
@@ -483,9 +490,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
         return self.get_observations()
 
     def get_observations(self) -> TensorDict:
-        """Return copies of the observation groups. They must be copies because rsl-rl keeps them until after the next
-        step.
-        """
+        """Return copies of the observation groups, because rsl-rl keeps the result until after the next step."""
         groups = {name: group.buffer.clone() for name, group in self.observation_groups.items()}
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)  # type: ignore[arg-type]
 
@@ -554,6 +559,7 @@ class BaseTask(PrivilegedTerms, VecEnv):
             "faults": self.nan_guard,
             "randomization": self.randomization,
             "rewards": self.rewards,
+            **{f"sensor_{name}": sensor for name, sensor in self.sensors.items()},
             **{f"observations_{name}": group for name, group in self.observation_groups.items()},
             **(errors.parts() if (errors := self.observation_terms.errors) is not None else {}),
         }
@@ -590,6 +596,5 @@ class BaseTask(PrivilegedTerms, VecEnv):
         """
         owners = [self.physics, self.physics.robot_state, *self.parts().values()]
         others = [*self.physics.state_tensors().values(), *(t for owner in owners for t in tensors_of(owner).values())]
-        known = {tensor.untyped_storage().data_ptr() for tensor in others}
-        own = {name: tensor for name, tensor in tensors_of(self).items() if tensor.shape[:1] == (self.num_envs,)}
-        return {name: tensor for name, tensor in own.items() if tensor.untyped_storage().data_ptr() not in known}
+        own = without_memory_of(others, tensors_of(self))
+        return {name: tensor for name, tensor in own.items() if tensor.shape[:1] == (self.num_envs,)}

@@ -10,7 +10,8 @@ from legged.envs.checks import check_mirror_kinds
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
 from legged.errors import ConfigError
-from legged.mdp.actuator import check_actuator, check_motor_model, check_slowest
+from legged.mdp.actuators.actuator import check_actuator
+from legged.mdp.actuators.motor_curve import check_motor_model, check_slowest
 from legged.mdp.control import acted_joints, action_scales, check_wheels, control_gains
 from legged.mdp.mirror_images import mirror_of_actions
 from legged.physics.fields import FIELDS
@@ -33,7 +34,7 @@ def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
     check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_wheels(robot, cfg.control, cfg.origins.where)
-    check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins.where)
+    check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins)
     check_motor_model(cfg.control.actuator, cfg.origins)
     if "velocity_limit" in cfg.domain_rand.ranges:
         lowest = draw_of(cfg.domain_rand.ranges["velocity_limit"]).range[0]

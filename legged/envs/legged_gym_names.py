@@ -15,9 +15,16 @@ import torch
 from torch import Tensor
 
 from legged.envs.class_checks import names_in
+from legged.graph import guard
 from legged.graph.guard import memory_of
 from legged.math import get_euler_xyz, masked_set_, quat_rotate
 from legged.robots.stance import lowest_point, stance
+
+guard.HINTS |= {
+    r"\bcommands\[:, ?([4-9]|\d\d)\b": "self.commands (N, 4) has vx, vy, yaw rate, heading; keep others in your own tensor",
+    r"\.terrain_heights\(": "self.height_scan.ground_at(points) has heights of the ground; self.base_height is above it",
+    r"\bquat_(conjugate|mul)\(": "legged.math has quat_multiply and quat_conjugate, w first",
+}
 
 WRITES = re.compile(r"__setitem__|__i(add|sub|mul|truediv|floordiv|mod|pow|and|or|xor)__|.*[^_]_")
 """Names of the methods that write to their tensor."""

@@ -37,12 +37,12 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     def _init_buffers(self) -> None:
         """Allocate tensors and parts for the robot, its ground, its commands and their curriculum."""
         super()._init_buffers()
-        cfg, kernels = self.cfg, self.physics.kernels
+        cfg, kernels = self.cfg, self.kernels
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
 
     def make_commands(self) -> None:
-        sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.physics.kernels, self.numbers)
+        sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.kernels, self.numbers)
         self.command_sampler, self.commands, self.is_moving = sampler, sampler.commands, sampler.is_moving
 
     def observation_scales(self) -> dict[str, Any]:

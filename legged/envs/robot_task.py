@@ -14,14 +14,14 @@ from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms
 from legged.math import evenly_spaced, quat_rotate
-from legged.mdp.actuator import with_rotors
+from legged.mdp.actuators.motor_curve import with_rotors
 from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
+from legged.mdp.sensors import HeightScan, Sensor
 from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.physics import RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
@@ -72,6 +72,13 @@ class RobotTask(RobotTerms, BaseTask):
         self.terrain = self.terrain or self.make_terrain()
         return RobotScene(self.robot, self.terrain)
 
+    def make_sensors(self) -> dict[str, Sensor]:
+        """Return the height scan. A subclass may add sensors."""
+        state = self.physics.robot_state
+        assert state is not None
+        self.height_scan = HeightScan(self.cfg.terrain, self.terrain, (state.base_pos, state.base_quat), self.kernels)
+        return {**super().make_sensors(), "height_scan": self.height_scan}
+
     def make_terrain(self) -> Terrain | None:
         """Hook: return the configured terrain; None for a plane. A subclass may return another terrain."""
         cfg = self.cfg.terrain
@@ -87,7 +94,7 @@ class RobotTask(RobotTerms, BaseTask):
         """Allocate tensors and parts for the robot, its ground and what the robot is asked to do."""
         super()._init_buffers()
         cfg, robot, n, device = self.cfg, self.robot, self.num_envs, self.device
-        kernels = self.physics.kernels
+        kernels = self.kernels
         state = self.physics.robot_state
         assert state is not None
         self.base_pos, self.base_quat = state.base_pos, state.base_quat
@@ -100,7 +107,7 @@ class RobotTask(RobotTerms, BaseTask):
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
         steps = cfg.train.runner.num_steps_per_env
-        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers)
+        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers, kernels)
         self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.make_commands()
@@ -119,7 +126,6 @@ class RobotTask(RobotTerms, BaseTask):
         self.dof_pos_limits = self._soft_limits(robot)
         self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
-        self.height_scan = HeightScan(cfg.terrain, self.terrain, n, device, kernels)
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         """Tiles on which episodes begin; None on a plane. Robots keep their tiles unless a subclass moves them."""
@@ -181,9 +187,9 @@ class RobotTask(RobotTerms, BaseTask):
         cfg = self.cfg.observations.height_map
         if is_exact(cfg):
             return None
-        scan, kernels, pose = self.height_scan, self.physics.kernels, (self.base_pos, self.base_quat)
+        scan, kernels, pose = self.height_scan, self.kernels, (self.base_pos, self.base_quat)
         if cfg.shift or cfg.shift_drift:
-            scan = HeightScan(self.cfg.terrain, self.terrain, self.num_envs, self.device, kernels)  # type: ignore[arg-type]
+            scan = HeightScan(self.cfg.terrain, self.terrain, pose, kernels)
         return HeightMapErrors(cfg, scan, pose, self.heights_seen, self.dt, self.numbers, kernels)
 
     def mirror_images(self) -> MirrorImages | None:
@@ -222,10 +228,6 @@ class RobotTask(RobotTerms, BaseTask):
             torch.sin(half_yaw, out=self.reset_qpos[:, 6])
             # In MuJoCo the linear velocity of a floating base is in the world frame, the angular velocity in the base frame.
             self.reset_qvel[:, :3].copy_(quat_rotate(self.reset_qpos[:, 3:7], self._reset_velocity.values[:, :3]))
-
-    def sense(self) -> None:
-        super().sense()
-        self.height_scan.update(self.base_pos, self.base_quat)
 
     def advance(self) -> None:
         super().advance()
@@ -304,13 +306,12 @@ class RobotTask(RobotTerms, BaseTask):
             **super().parts(),
             "contacts": self.contacts,
             "control": self.control,
-            "height_scan": self.height_scan,
             "pushes": self.pushes,
         }
         if self.disturbances.STATE:
             parts["disturbances"] = self.disturbances
         if self.control.actuator is not None:
-            parts["actuator"] = self.control.actuator
+            parts |= self.control.actuator.parts()
         if self.terrain_curriculum is not None:
             parts["terrain_curriculum"] = self.terrain_curriculum
         return parts

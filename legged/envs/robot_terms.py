@@ -12,8 +12,8 @@ from legged.envs.privileged_terms import MIRROR_KINDS
 from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.mirror_images import MirrorKind
+from legged.mdp.sensors.height_scan import HeightScan
 from legged.physics import Physics
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot

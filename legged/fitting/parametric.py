@@ -1,6 +1,6 @@
 """A parametric drive fitted to a log: P and D gains, delay, torque-speed line of the motor and friction of the joint.
 
-The formulas are those of legged/mdp/actuator.py. For each delay the Levenberg-Marquardt method minimises the squared error of
+The formulas are those of legged/mdp/actuators/. For each delay the Levenberg-Marquardt method minimises the squared error of
 the torque; the delay with the smallest error is chosen.
 """
 

@@ -1,4 +1,4 @@
-"""Training of actuator networks on logs, for legged/mdp/actuator_network.py."""
+"""Training of actuator networks on logs, for legged/mdp/actuators/network.py."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from legged.errors import ConfigError
 from legged.fitting.log import ActuatorLog
-from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
+from legged.mdp.actuators.network import ActuatorNetwork, NetworkWeights
 
 LEARNING_RATE = {"mlp": 3e-3, "lstm": 1e-2}
 BATCH = 4096

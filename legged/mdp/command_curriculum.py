@@ -8,7 +8,7 @@ from torch import Tensor
 from legged.config.schema import CommandCurriculumConfig
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 class CommandCurriculum:

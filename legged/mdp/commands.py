@@ -10,7 +10,7 @@ from legged.math import masked_set_, wrap_to_pi, yaw_of
 from legged.mdp.random_pool import RandomPool
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a command counts as motion."""

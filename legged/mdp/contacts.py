@@ -8,7 +8,7 @@ from torch import Tensor
 from legged.math import masked_set_
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""

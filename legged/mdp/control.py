@@ -11,13 +11,14 @@ from torch import Tensor
 from legged.config.schema import RobotControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
-from legged.mdp.actuator import Actuator, is_ideal
+from legged.mdp.actuators.actuator import Actuator, check_actuator, is_ideal
+from legged.mdp.actuators.model import Motors
 from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 class Control:
@@ -84,9 +85,12 @@ class Control:
         self.actuator: Actuator | None = None
         """Model of motors that are not ideal; None for ideal motors."""
         if not is_ideal(cfg.actuator):
-            drawn = numbers or RandomPool(len(torques), torques.device)
-            self.actuator = Actuator(robot, cfg, self._middle(), (len(torques), robot.num_dof), sim_dt, drawn, kernels)
-            self._target = self.actuator.newest
+            check_actuator(robot, cfg, sim_dt)
+            n, device = len(torques), torques.device
+            drawn = numbers or RandomPool(n, device)
+            motors = Motors(robot, cfg.actuator, n, cfg.decimation, sim_dt, device, drawn, self._middle, kernels)
+            self.actuator = Actuator(motors)
+            self._target = self.actuator.line.newest
 
     def vary(self, drawn: Mapping[str, Tensor]) -> None:
         """Apply randomised properties, (N,) or (N, D) each: factors on gains and torque limits, and `joint_offset`, the error
@@ -126,7 +130,7 @@ class Control:
     def set_actions(self, actions: Tensor) -> None:
         """Set the actions (N, A) that the following calls of `compute` carry out."""
         if self.actuator is not None:
-            self.actuator.advance()
+            self.actuator.line.advance()
         middle = self._middle()
         if self._columns is None and isinstance(self.action_scale, float):
             torch.add(middle, actions, alpha=self.action_scale, out=self._target)
@@ -177,7 +181,7 @@ class Control:
         if "V" in self._has:
             masked_set_(self._last_dof_vel, mask, 0.0)
         if self.actuator is not None:
-            self.actuator.reset(mask, self._middle())
+            self.actuator.reset(mask)
 
 
 def check_wheels(robot: Robot, cfg: RobotControlConfig, where: Callable[[str], str] = str) -> None:

@@ -11,7 +11,7 @@ from legged.config.schema import DrawConfig
 from legged.mdp.random_pool import RandomPool, Slice
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 KINDS = ("uniform", "log_uniform", "gaussian")
 

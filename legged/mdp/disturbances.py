@@ -1,5 +1,7 @@
 """Disturbances: kicks of the base and forces on bodies, at random intervals for each robot."""
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
@@ -8,6 +10,9 @@ from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool
 from legged.physics import Physics
+
+if TYPE_CHECKING:
+    from legged.mdp.kernels.task import TaskKernels
 
 AXES = ("x", "y", "z")
 TURNS = ("roll", "pitch", "yaw")
@@ -102,12 +107,13 @@ class Disturbances:
         dt: float,
         steps_per_iteration: int,
         numbers: RandomPool,
+        kernels: "TaskKernels | None" = None,
     ) -> None:
         """Build the kicks and forces that `cfg` names. `dt` is the control step [s]. `steps_per_iteration`, the number of
         control steps in a training iteration, converts `grow` [iterations] to control steps. Random numbers come from the
         pool `numbers`.
         """
-        self._dt, self._kernels = dt, physics.kernels
+        self._dt, self._kernels = dt, kernels
         num_envs, device = numbers.num_envs, numbers.device
         self._time_left = torch.zeros(num_envs, len(cfg.kicks), device=device)
         self._left = torch.zeros(num_envs, 2 * len(cfg.forces), device=device)

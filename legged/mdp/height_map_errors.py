@@ -8,11 +8,11 @@ from torch import Tensor
 
 from legged.config.schema import HeightMapConfig
 from legged.math import masked_set_
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.random_pool import RandomPool
+from legged.mdp.sensors.height_scan import HeightScan
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 def is_exact(cfg: HeightMapConfig) -> bool:
@@ -82,7 +82,7 @@ class HeightMapErrors:
         if self._moved:
             # At a place x, a map that is displaced by `error` shows the ground at x - error.
             torch.sub(self._position, self.error, out=self._place)
-            self._scan.update(self._place, self._orientation)
+            self._scan.look_from(self._place, self._orientation)
         return torch.nan_to_num(self._seen(self._scan.heights + self.error[:, 2:]), nan=0.0)
 
     def cut_holes(self, observed: Tensor) -> None:

@@ -15,7 +15,7 @@ from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, MODEL_FIELDS, Physics
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 VARIANTS = 1024
 """Number of variants of the model from which worlds choose if masses, inertias or armatures have `when: reset` or `interval`.
@@ -114,7 +114,14 @@ class Randomization:
                 self._given = self.variants.clone()
             physics.choose_variants(torch.ones_like(self.chosen, dtype=torch.bool), self.chosen)
 
-    def prepare(self, physics: Physics, numbers: RandomPool, dt: float, steps_per_iteration: int) -> None:
+    def prepare(
+        self,
+        physics: Physics,
+        numbers: RandomPool,
+        dt: float,
+        steps_per_iteration: int,
+        kernels: "TaskKernels | None" = None,
+    ) -> None:
         """Allocate buffers for draws during training, and reserve random numbers in the pool `numbers`. `dt` is the control
         step [s]. Does nothing if all fields are drawn only once, at the start.
         """
@@ -141,7 +148,7 @@ class Randomization:
         self._fresh, self._none = torch.zeros_like(self.drawn), torch.zeros(1, 1, device=device)
         self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
         self._any_due, self._chosen_due = torch.zeros(2, worlds, dtype=torch.bool, device=device)
-        self._kernels = physics.kernels
+        self._kernels = kernels
         self._interval = torch.tensor([float(max(1, round(each / dt))) for each in intervals], device=device)
         self.steps_left = torch.floor(torch.rand(worlds, len(intervals), device=device) * self._interval) + 1.0
         """(N, I) control steps until the next draw of each of I intervals. The first draws are spread over a whole

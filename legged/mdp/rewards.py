@@ -11,7 +11,7 @@ from legged.math import masked_set_
 from legged.mdp.nan_guard import LARGEST
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 class Rewards:

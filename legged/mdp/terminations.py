@@ -47,6 +47,13 @@ class Terminations:
         torch.gt(reduce(torch.logical_or, time_outs, over), self.failed, out=self.timed_out)  # timed out and not failed
         torch.logical_or(self.failed, self.timed_out, out=self.ended)
 
+    def settle(self) -> None:
+        """Make failures and time-outs agree with `ended`. This is necessary if an override of `check_termination` writes only
+        `reset_buf`, as in legged_gym. An episode that ends without a time-out has failed.
+        """
+        self.timed_out.logical_and_(self.ended)
+        torch.gt(self.ended, self.timed_out, out=self.failed)
+
     def _value(self, name: str, function: Callable[[], Tensor]) -> Tensor:
         with calling(f"_terminate_{name}"):
             value = function()

@@ -9,7 +9,7 @@ from legged.config.schema import TerrainConfig
 from legged.terrain.terrain import Terrain
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
 PROMOTED, DEMOTED = 0.8, 0.5

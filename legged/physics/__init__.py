@@ -119,6 +119,7 @@ def make_physics(
     quantities: Collection[str] = (),
     where: Callable[[str], str] = str,
     pushed: bool = False,
+    launches: Collection[Callable[[], object]] = (),
 ) -> Physics:
     """Return `num_envs` worlds of `scene` in the engine that `sim.physics` names. Only the requested engine is imported.
 
@@ -131,6 +132,7 @@ def make_physics(
         quantities: arrays of MuJoCo's data that `Physics.quantity` will return.
         where: maps a dotted path of the configuration to the beginning of an error message.
         pushed: True if the task applies external forces to bodies (`Physics.forces`).
+        launches: functions that launch the task's own kernels. Engines in Warp compile these kernels together with theirs.
 
     Raises:
         ConfigError, ValueError: see `check_engine`.
@@ -143,15 +145,15 @@ def make_physics(
             from legged.physics.newton.physics import NewtonPhysics
 
         assert isinstance(scene, RobotScene)
-        return NewtonPhysics(scene, sim, num_envs, device, randomized, pushed)
+        return NewtonPhysics(scene, sim, num_envs, device, randomized, pushed, launches)
     if engine == "mujoco_warp":
         with importing():
             from legged.physics.warp.mujoco_warp import MujocoWarpPhysics, NoBlocks
 
         if sim.physics == "mujoco_warp" or device.type == "cuda":
-            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, pushed=pushed)
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, False, pushed, launches)
         try:
-            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, only_blocks=True, pushed=pushed)
+            return MujocoWarpPhysics(scene, sim, num_envs, device, randomized, quantities, True, pushed, launches)
         except (NoBlocks, ConfigError) as reason:
             why_c_engine = str(reason)
     from legged.physics.mujoco import MujocoPhysics

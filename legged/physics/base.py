@@ -2,7 +2,8 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
-from typing import TYPE_CHECKING
+from contextlib import AbstractContextManager
+from typing import Any
 
 import mujoco
 import torch
@@ -11,9 +12,6 @@ from torch import Tensor
 from legged.physics.quantities import found
 from legged.physics.robot_state import RobotState
 from legged.state import take
-
-if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
 
 
 class Physics(ABC):
@@ -54,8 +52,9 @@ class Physics(ABC):
     """Number of kernel modules that were not in the cache and were compiled for this physics."""
     overflowed: Tensor
     """(N,) bool: True for worlds that lost contacts or constraint rows since the last refresh, for lack of memory."""
-    kernels: "TaskKernels | None" = None
-    """Warp kernels that replace torch operations in parts of a task; None if the engine does not use Warp."""
+    on_device: Callable[[], AbstractContextManager[Any]] | None = None
+    """Function that returns a context in which Warp launches on the engine's device and torch's current stream; None if the
+    engine does not use Warp."""
     library_step: Callable[[], None] | None = None
     """Physics step of the engine's library, for comparison with the fused step; None if `step` is the library's step."""
     _quantities: dict[str, Tensor]

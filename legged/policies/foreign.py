@@ -19,7 +19,7 @@ from legged.config.yaml_files import read_yaml
 from legged.deploy.contract import Contract, read_contract
 from legged.deploy.policy import open_onnx, warm_up
 from legged.errors import ConfigError, suggest
-from legged.mdp.actuator import is_ideal
+from legged.mdp.actuators.actuator import is_ideal
 from legged.process.paths import data_folder, exists
 from legged.robots.patterns import match_values
 from legged.robots.robot import Robot

@@ -1,6 +1,6 @@
 """One robot in C MuJoCo, with sensors and with the motor model of training. Commands may arrive at any time.
 
-`legged.mdp.actuator` computes the motors of thousands of robots in torch, with one command per control step. This file has
+`legged.mdp.actuators` computes the motors of thousands of robots in torch, with one command per control step. This file has
 the same formulas in numpy. For one robot they take 0.02 ms per physics step, but 0.1 ms in torch. MuJoCo's own step takes
 about 0.02 ms.
 """
@@ -19,8 +19,11 @@ from legged.config.schema import ActuatorConfig, SimConfig
 from legged.deploy.contract import SCANS, Contract
 from legged.deploy.interface import Reading, RobotFacts
 from legged.errors import ConfigError, RunError
-from legged.mdp.actuator import check_actuator, check_motor_model, friction_numbers, modelled_joints, motor_numbers
-from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights
+from legged.mdp.actuators.actuator import check_actuator, one_robot
+from legged.mdp.actuators.friction import friction_numbers
+from legged.mdp.actuators.model import JointStep, modelled_joints, registered_models
+from legged.mdp.actuators.motor_curve import check_motor_model, motor_numbers
+from legged.mdp.actuators.network import ActuatorNetwork, NetworkWeights
 from legged.physics import RobotScene
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
@@ -60,7 +63,7 @@ def motors_config(
     cfg = override(from_dict({"task": "simulated", "robot": str(robot.folder), **own}, source=source), changes)
     assert has_robot(cfg)
     try:
-        check_actuator(robot, cfg.control, dt, cfg.origins.where)
+        check_actuator(robot, cfg.control, dt, cfg.origins)
     except ConfigError as error:
         raise ConfigError(str(error).replace("sim.dt", "--sim-dt")) from error
     check_motor_model(cfg.control.actuator, cfg.origins)
@@ -88,6 +91,7 @@ class Motors:
             weights = NetworkWeights.load(cfg.network)
             self._network = ActuatorNetwork(weights, 1, robot.num_dof, dt, torch.device("cpu"))
             self._by_network = np.isin(np.arange(robot.num_dof), modelled_joints(robot, cfg))
+        self._own = registered_models(one_robot(robot, cfg, dt)).values()
 
     def _draw(self) -> int:
         low, high = self._range
@@ -108,7 +112,8 @@ class Motors:
         torques = np.clip(torques, -self._effort, self._effort)
         slow = np.exp(-np.square(dq / self._stribeck))
         friction = (self._coulomb + self._extra * slow) * np.tanh(dq / self._smoothing) + self._viscous * dq
-        return np.clip(torques - friction, -self._effort, self._effort)
+        torques = np.clip(torques - friction, -self._effort, self._effort)
+        return self._by_own_models(torques, target, q, dq) if self._own else torques
 
     def _arrived(self, command: np.ndarray) -> np.ndarray:
         """Return the newest command that has arrived; commands never overtake each other."""
@@ -118,6 +123,17 @@ class Motors:
         while len(self._past) > self.delay + 1:
             self._past.popleft()
         return self._past[0]
+
+    def _by_own_models(self, *joints: np.ndarray) -> np.ndarray:
+        """Return the torques (D,) [N m] of the user-defined models, within the effort limits. `joints` are the torques of the
+        built-in models [N m], targets [rad], angles [rad] and velocities [rad/s], (D,) each.
+        """
+        rows = (torch.tensor(each, dtype=torch.float32).unsqueeze(0) for each in (*joints, self._effort))
+        torques, *step = rows
+        with torch.inference_mode():
+            for model in self._own:
+                torques = model.torques(torques, JointStep(*step))
+        return np.clip(torques[0].double().numpy(), -self._effort, self._effort)
 
     def _learned(self, error: np.ndarray, dq: np.ndarray) -> np.ndarray:
         """Return the torques (D,) of the network [N m]."""

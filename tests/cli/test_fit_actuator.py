@@ -15,8 +15,9 @@ from legged.config import load_config
 from legged.errors import ConfigError
 from legged.fitting.log import check_alike, read_log
 from legged.fitting.parametric import SMOOTHING, Drive, delayed, fit_drive
-from legged.mdp.actuator import Friction, MotorCurve
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.friction import Friction
+from legged.mdp.actuators.motor_curve import MotorCurve
+from legged.mdp.actuators.network import NetworkWeights
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
@@ -89,7 +90,7 @@ def test_the_drive_is_the_actuator_of_the_task():
     low, high = MotorCurve(stall, fastest).limits(speeds, effort)
     asked = torch.tensor(50.0 * error - 2.0 * velocity, dtype=torch.float32).unsqueeze(1)
     friction = Friction(*[torch.tensor([v]) for v in (1.0, 1.5, 0.3)], 0.2, SMOOTHING)
-    wanted = torch.minimum(torch.maximum(asked, low), high) - friction.torques(speeds)
+    wanted = torch.minimum(torch.maximum(asked, low), high) - friction.resistance(speeds)
     np.testing.assert_allclose(drive.torques(error, velocity), wanted[:, 0].numpy(), atol=1e-4)
 
 
@@ -172,7 +173,7 @@ def test_the_command_writes_what_a_task_reads(tmp_path, kind, capsys):
     renamed["control.actuator.joints"] = ["KFE"]
     task = small_task(*renamed.items(), ("control.actuator.network", "fit/network.npz"))
     task.step(torch.zeros(4, 12))
-    assert task.control.actuator.network.kind == kind
+    assert task.control.actuator.learned.network.kind == kind
     assert torch.isfinite(task.torques).all()
 
 
@@ -192,7 +193,7 @@ def test_a_network_in_a_task_gives_what_the_fit_says_of_it(tmp_path):
     for k in range(12):
         law.set_actions(actions[k])
         found = law.compute(angles[k], speeds[k]).clone()
-        errors.append(law.actuator.newest - angles[k])
+        errors.append(law.actuator.line.newest - angles[k])
     seen = [e * float(weights.scales[0]) for e in (errors[11], errors[9], errors[7])]
     seen += [v * float(weights.scales[1]) for v in (speeds[11], speeds[9], speeds[7])]
     x = torch.stack(seen, dim=2)

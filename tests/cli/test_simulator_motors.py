@@ -14,7 +14,7 @@ from legged.config.schema import ActuatorConfig, RobotControlConfig, SimConfig
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError
 from legged.learning.runner import Runner
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.network import NetworkWeights
 from legged.mdp.control import Control
 from legged.policies.export import export
 from legged.robots.robot import load_robot

@@ -12,8 +12,8 @@ from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.display import Progress
 from legged.mdp.commands import Commands
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.observations import ObservationGroup, ObservationTerms
+from legged.mdp.sensors import HeightScan
 from legged.mdp.terrain_curriculum import TerrainCurriculum
 from legged.registry import make_task, task_config
 from legged.terrain import Terrain, TileSpec
@@ -60,16 +60,21 @@ def step_terrain() -> Terrain:
     return Terrain.of_tiles([[TileSpec("pit", 0.4)]], cfg, np.random.default_rng(0))
 
 
+def pose(n):
+    """Positions and orientations that no test reads."""
+    return torch.zeros(n, 3), torch.zeros(n, 4)
+
+
 def test_scan_points_turn_with_the_heading_and_read_the_lower_of_neighbours():
     """From (1.45, 0.05) the pit's riser is at x = 2: points ahead of it see 0, the others -0.4; turned by 180 degrees all
     see the pit; by 90 degrees the riser is on the right. The cell beside the riser counts as low (legged_gym).
     """
     cfg = TerrainConfig(measured_points_x=(0.0, 0.3, 0.7), measured_points_y=(-0.7, 0.0))
-    scan = HeightScan(cfg, step_terrain(), 3, CPU)
+    scan = HeightScan(cfg, step_terrain(), pose(3))
     points = torch.tensor([[x, y] for x in (0.0, 0.3, 0.7) for y in (-0.7, 0.0)])
     torch.testing.assert_close(scan.points, points)
     place = torch.tensor([[1.45, 0.05, 0.2]]).expand(3, 3)
-    scan.update(place, yawed(0.0, 180.0, 90.0))
+    scan.look_from(place, yawed(0.0, 180.0, 90.0))
     low = -0.4
     expected = [[low, low, low, low, 0.0, 0.0], [low] * 6, [0.0, low, 0.0, low, 0.0, low]]
     torch.testing.assert_close(scan.heights, torch.tensor(expected))
@@ -82,8 +87,8 @@ def test_what_a_point_reads_beside_a_riser_is_a_setting(scan, seen):
     from the pit's other side, at y = -2.05, the cell next to it belongs to the ground and has the pit as its neighbour.
     """
     cfg = TerrainConfig(measured_points_x=(0.0,), measured_points_y=(0.0,), scan=scan)
-    reading = HeightScan(cfg, step_terrain(), 3, CPU)
-    reading.update(torch.tensor([[1.95, 0.05, 0.0], [0.05, -2.05, 0.0], [2.05, 0.05, 0.0]]), yawed(0.0, 0.0, 0.0))
+    reading = HeightScan(cfg, step_terrain(), pose(3))
+    reading.look_from(torch.tensor([[1.95, 0.05, 0.0], [0.05, -2.05, 0.0], [2.05, 0.05, 0.0]]), yawed(0.0, 0.0, 0.0))
     torch.testing.assert_close(reading.heights[:, 0], torch.tensor(seen))
     torch.testing.assert_close(reading.ground, torch.tensor(seen))
 
@@ -98,15 +103,15 @@ def test_every_map_of_a_task_reads_what_its_configuration_says():
 
 
 def test_scan_beyond_the_map_and_of_a_robot_that_blew_up_reads_the_border():
-    scan = HeightScan(TerrainConfig(), step_terrain(), 2, CPU)
-    scan.update(torch.tensor([[1e9, -1e9, 0.0], [math.nan, math.inf, 0.0]]), yawed(0.0, 0.0))
+    scan = HeightScan(TerrainConfig(), step_terrain(), pose(2))
+    scan.look_from(torch.tensor([[1e9, -1e9, 0.0], [math.nan, math.inf, 0.0]]), yawed(0.0, 0.0))
     assert torch.isfinite(scan.heights).all()
     assert scan.ground[0] == 0.0
 
 
 def test_scan_on_a_plane_is_zero():
-    scan = HeightScan(TerrainConfig(), None, 2, CPU)
-    scan.update(torch.full((2, 3), 5.0), yawed(0.0, 30.0))
+    scan = HeightScan(TerrainConfig(), None, pose(2))
+    scan.look_from(torch.full((2, 3), 5.0), yawed(0.0, 30.0))
     assert scan.heights.shape == (2, 187)
     assert not scan.heights.any()
 
@@ -136,7 +141,7 @@ def yaw(task) -> torch.Tensor:
 
 def test_base_height_is_above_the_ground_around(task):
     task.reset()
-    task.height_scan.update(task.base_pos, task.base_quat)
+    task.height_scan.update()
     height = task.base_pos[:, 2] - task.height_scan.heights.mean(dim=1)
     torch.testing.assert_close(task._reward_base_height(), (height - 0.5).square())
     assert (height - 0.6).abs().max() < 0.25  # spawned at 0.6 m, near the platform, whatever its level

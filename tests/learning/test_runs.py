@@ -18,7 +18,7 @@ from legged.errors import ConfigError, RunError
 from legged.evaluation.reports.record import folders_in
 from legged.learning import run_folder as runs
 from legged.learning.run_folder import checkpoints, code_state, create_run, discard_run, find_checkpoint, run_config
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.network import NetworkWeights
 from legged.policies.restore import TrainedPolicy
 
 pytestmark = pytest.mark.usefixtures("workplace")

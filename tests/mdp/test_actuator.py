@@ -13,11 +13,13 @@ from legged.config.actuator import ActuatorConfig
 from legged.config.loader import from_dict
 from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
-from legged.mdp.actuator import Friction, MotorCurve, check_motor_model, is_ideal
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.actuator import is_ideal
+from legged.mdp.actuators.friction import Friction
+from legged.mdp.actuators.motor_curve import MotorCurve, check_motor_model
+from legged.mdp.actuators.network import NetworkWeights
 from legged.mdp.control import Control
+from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
-from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 
 N, D, DT = 8, 12, 0.005
@@ -119,7 +121,7 @@ def test_friction_by_hand():
     friction = Friction(torch.tensor([2.0]), torch.tensor([3.0]), torch.tensor([0.5]), stribeck_velocity=0.2, smoothing=0.1)
     speeds = torch.tensor([[0.0, 0.2, -0.2, 10.0]]).T
     at_02 = (2.0 + 1.0 * np.exp(-1.0)) * np.tanh(2.0) + 0.5 * 0.2
-    assert friction.torques(speeds)[:, 0].tolist() == pytest.approx([0.0, at_02, -at_02, 2.0 + 5.0], rel=1e-6)
+    assert friction.resistance(speeds)[:, 0].tolist() == pytest.approx([0.0, at_02, -at_02, 2.0 + 5.0], rel=1e-6)
 
 
 @KERNELS

@@ -199,7 +199,7 @@ def test_a_shifted_map_has_the_ground_of_another_place():
     obs, *_ = task.step(torch.zeros(4, 12))
     there = task.base_pos.clone() - errors.error
     at_home = scan.heights.clone()
-    scan.update(there, task.base_quat)
+    scan.look_from(there, task.base_quat)
     seen = (task.base_pos[:, 2:] - 0.5 - scan.heights).clamp(-1.0, 1.0)
     torch.testing.assert_close(obs["actor"], seen, rtol=1e-5, atol=1e-5)
     assert not torch.equal(at_home, scan.heights)

@@ -12,7 +12,8 @@ from legged.config.actuator import ActuatorConfig
 from legged.config.robot import RobotControlConfig
 from legged.config.schema import SimConfig
 from legged.errors import ConfigError
-from legged.mdp.actuator import MotorCurve, check_actuator, with_rotors
+from legged.mdp.actuators.actuator import check_actuator
+from legged.mdp.actuators.motor_curve import MotorCurve, with_rotors
 from legged.physics.scene.robot_scene import RobotScene, robot_source
 from legged.robots.robot import load_robot
 

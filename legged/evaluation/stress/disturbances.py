@@ -11,8 +11,8 @@ from legged.config import LeggedConfig, override
 from legged.envs import LeggedRobot
 from legged.math import quat_rotate
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
-from legged.mdp.height_scan import HeightScan
 from legged.mdp.random_pool import RandomPool
+from legged.mdp.sensors.height_scan import HeightScan
 from legged.physics import FIELDS, MODEL_FIELDS, Scene
 from legged.registry import task_class
 from legged.robots.similarity import Size, grown
@@ -236,7 +236,7 @@ class StressedTask(LeggedRobot):
         )
         points = self.measured_heights.shape[1]
         self._map_holes = 0.5 * (draw(points) + 1.0) < self._per_robot("map_holes").unsqueeze(1)
-        if self.control.actuator is not None and self.control.actuator.longest:
+        if self.control.actuator is not None and self.control.actuator.line.longest:
             steps = (self._per_robot("delay") / self.cfg.sim.dt).round()
             low, high = self.own_delay
             own = (low + 0.5 * (draw() + 1.0) * (high + 1 - low)).floor().clamp_(max=high)
@@ -244,13 +244,13 @@ class StressedTask(LeggedRobot):
 
     def make_height_map(self) -> HeightMapErrors | None:
         """Return the height map's errors for the robots' disturbances, or None if the height map is exact."""
-        cfg, n = self.cfg.observations.height_map, self.num_envs
+        cfg, n, pose = self.cfg.observations.height_map, self.num_envs, (self.base_pos, self.base_quat)
         if is_exact(cfg):
             return None
         scan = self.height_scan
         if cfg.shift:
-            scan = HeightScan(self.cfg.terrain, self.terrain, n, torch.device(self.device), self.physics.kernels)
-        pose, numbers = (self.base_pos, self.base_quat), RandomPool(n, torch.device(self.device))
+            scan = HeightScan(self.cfg.terrain, self.terrain, pose, self.kernels)
+        numbers = RandomPool(n, torch.device(self.device))
         found = GivenMap(cfg, scan, pose, self.heights_seen, self.dt, numbers)
         found.given = self._map_error, self._map_holes
         return found

@@ -33,7 +33,7 @@ from legged.evaluation.tiles import dividing_cell, tiles_apart
 from legged.evaluation.velocity_grid import axes_of, number_or_null
 from legged.evaluation.velocity_tracking import hold
 from legged.figures import figure
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.network import NetworkWeights
 from legged.mdp.tracking_error import velocity_error
 from legged.policies.episodes import Policy
 from legged.policies.restore import restore, undisturbed

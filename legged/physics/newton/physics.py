@@ -1,6 +1,6 @@
 """Newton's solvers behind the `Physics` interface, on a GPU or on Warp's CPU device."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import newton
 import torch
@@ -34,8 +34,10 @@ class NewtonPhysics(WarpPhysics):
         device: torch.device,
         randomized: Collection[str] = (),
         pushed: bool = False,
+        launches: Collection[Callable[[], object]] = (),
     ) -> None:
-        """Build the scene on `device` and set all robots to the model's initial state. Kernels are compiled on first use.
+        """Build the scene on `device` and set all robots to the model's initial state. Kernels are compiled on first use,
+        and those that `launches` launch with them.
 
         Raises:
             ConfigError: the robot has meshes, and a package that Newton needs to read them is not installed.
@@ -66,7 +68,7 @@ class NewtonPhysics(WarpPhysics):
                 self._simulation.push_with(self.forces, self.model)
             self._state_io.read()
             start = self.qpos.clone()
-        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, *launches)
         self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *launches))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()

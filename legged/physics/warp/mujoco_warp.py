@@ -89,9 +89,10 @@ class MujocoWarpPhysics(WarpPhysics):
         quantities: Collection[str] = (),
         only_blocks: bool = False,
         pushed: bool = False,
+        launches: Collection[Callable[[], object]] = (),
     ) -> None:
         """Build the scene on `device` and set all worlds to the model's initial state. Kernels are compiled on first use,
-        including those that `randomized` fields need.
+        including those that `randomized` fields need, and those that `launches` launch.
 
         Raises:
             ConfigError: mujoco-warp cannot simulate the model, or the model does not support the requested `sim.step`.
@@ -140,7 +141,7 @@ class MujocoWarpPhysics(WarpPhysics):
                 slots = 0 if self._contacts is None else int(self._contacts.constants["SLOTS"])
                 of = (self.model, scene.robot, self.robot_state)
                 self._state_io = MujocoWarpStateIO(self._m, d, self.overflowed, *of, slots)
-        launches = (self._state_io.kinematics, self._state_io.contact_forces, self.kernels.name_module)
+        launches = (self._state_io.kinematics, self._state_io.contact_forces, *launches)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *launches, *constants))
         self.library_step = self._library_step

@@ -14,7 +14,6 @@ from torch import Tensor
 from legged.physics.base import Physics
 from legged.physics.robot_state import DrivenJoints
 from legged.physics.warp.state_io import StateIO
-from legged.physics.warp.task_kernels import TaskKernels
 
 
 class WarpPhysics(Physics):
@@ -26,7 +25,6 @@ class WarpPhysics(Physics):
     """
 
     capturable = True
-    kernels: TaskKernels
     _state_io: StateIO
     _joints: DrivenJoints | None = None
 
@@ -35,7 +33,7 @@ class WarpPhysics(Physics):
         self.num_envs, self.dt, self.device = num_envs, dt, device
         self.overflowed = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._wp_device = wp.device_from_torch(device)
-        self.kernels = TaskKernels(self._on_device)
+        self.on_device = self._on_device
         self._forces_read = False
         self._advance: Callable[[], Any] = self._step
 

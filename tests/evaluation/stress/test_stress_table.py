@@ -13,7 +13,7 @@ from legged.evaluation.stress.disturbances import ALONE, NOMINAL, Disturbance, c
 from legged.evaluation.stress.measuring import STAIRS, followed, score, settings
 from legged.evaluation.success import to_run_out
 from legged.evaluation.tiles import dividing_cell, tiles_apart
-from legged.mdp.actuator_network import NetworkWeights
+from legged.mdp.actuators.network import NetworkWeights
 from legged.registry import task_class, task_config
 from legged.robots.similarity import Size
 from legged.terrain import TileSpec

@@ -8,7 +8,7 @@ softsign. All joints share one network.
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
@@ -16,9 +16,10 @@ from torch import Tensor
 
 from legged.errors import ConfigError, suggest
 from legged.math import masked_set_
+from legged.mdp.actuators.model import ActuatorModel, JointStep, Motors, modelled_joints
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 KINDS = ("mlp", "lstm")
 FORMAT = 1
@@ -156,7 +157,7 @@ class ActuatorNetwork:
             ConfigError: the physics step `sim_dt` [s] does not fit the samples that the network was trained on.
         """
         self.kind, self._kernels = weights.kind, kernels
-        self._shape, self._rows = (num_envs, joints), num_envs * joints
+        self.shape, self._rows = (num_envs, joints), num_envs * joints
         self._every, self._samples = weights.steps_between(sim_dt), weights.samples
         self._scales = self._position, self._velocity, self._torque = tuple(map(float, weights.scales))
         self._layers = [{name: torch.tensor(array, device=device) for name, array in of.items()} for of in weights.layers]
@@ -177,7 +178,7 @@ class ActuatorNetwork:
             ]
             self._weights = torch.cat(parts)
             self._scratch = torch.zeros(2, max(widths), self._rows, device=device)
-            self._found = torch.zeros(self._shape, device=device)
+            self._found = torch.zeros(self.shape, device=device)
 
     def torques(self, error: Tensor, dof_vel: Tensor) -> Tensor:
         """Return the torques (N, D) [N m] of this physics step. `error` (N, D) is the target minus the joint angle [rad],
@@ -191,7 +192,7 @@ class ActuatorNetwork:
                 self._kernels.run_lstm(error, dof_vel, *self._scales, *net)
             return self._found
         found = self._mlp(error, dof_vel) if self.kind == "mlp" else self._lstm(error, dof_vel)
-        return (self._torque * found).view(self._shape)
+        return (self._torque * found).view(self.shape)
 
     def _mlp(self, error: Tensor, dof_vel: Tensor) -> Tensor:
         if self.state.shape[1] > 1:
@@ -213,9 +214,41 @@ class ActuatorNetwork:
             c = torch.sigmoid(keep) * c + torch.sigmoid(take) * torch.tanh(new)
             x = torch.sigmoid(show) * torch.tanh(c)
             for k, value in enumerate((x, c)):
-                self.state[:, 2 * i + k, :size].copy_(value.view(size, *self._shape).permute(1, 0, 2))
+                self.state[:, 2 * i + k, :size].copy_(value.view(size, *self.shape).permute(1, 0, 2))
         return torch.addmm(self._layers[-1]["bias"].unsqueeze(1), self._layers[-1]["weight"], x)
 
     def reset(self, mask: Tensor) -> None:
         """Reset the state of the robots in `mask` (N,)."""
         masked_set_(self.state, mask, 0.0)
+
+
+class LearnedTorque(ActuatorModel):
+    """Torques of a network in place of those of the P law, at some joints."""
+
+    def __init__(self, network: ActuatorNetwork, by_network: Tensor) -> None:
+        """Use the torques of `network` at the joints of the mask `by_network` (D,)."""
+        self.network, self._by_network = network, by_network
+        self._error = torch.zeros(network.shape, device=by_network.device)
+
+    @classmethod
+    def of(cls, motors: Motors) -> Self:
+        """Return the network that the settings name.
+
+        Raises:
+            ConfigError: the file is missing or invalid, or does not fit the physics step.
+        """
+        joints, cfg = motors.robot.num_dof, motors.cfg
+        weights = NetworkWeights.load(cfg.network)
+        network = ActuatorNetwork(weights, motors.num_envs, joints, motors.sim_dt, motors.device, motors.kernels)
+        has = modelled_joints(motors.robot, cfg)
+        return cls(network, torch.tensor([i in has for i in range(joints)], device=motors.device))
+
+    def torques(self, torques: Tensor, step: JointStep) -> Tensor:
+        torch.sub(step.target, step.dof_pos, out=self._error)
+        return torch.where(self._by_network, self.network.torques(self._error, step.dof_vel), torques)
+
+    def reset(self, mask: Tensor) -> None:
+        self.network.reset(mask)
+
+    def describe(self, joint: int) -> str:
+        return f"torque by a network ({self.network.kind})" if bool(self._by_network[joint]) else ""

@@ -23,12 +23,12 @@ from legged.mdp.control import Control
 from legged.mdp.distributions import Distributions
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
-from legged.mdp.height_scan import HeightScan
+from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.randomization import Pushes, Randomization
 from legged.mdp.rewards import Rewards
+from legged.mdp.sensors import HeightScan
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.physics.warp.task_kernels import TaskKernels
 from legged.robots.robot import load_robot
 from legged.state import state_of
 from legged.terrain import Terrain
@@ -128,11 +128,11 @@ def ground() -> Terrain:
 @pytest.mark.parametrize("scan", ["lowest", "own", "highest"])
 def test_the_ground_is_scanned_alike_on_it_beyond_it_and_nowhere(scan):
     terrain = ground()
-    parts = pair(lambda kernels: HeightScan(TerrainConfig(scan=scan), terrain, N, CPU, kernels))
-    base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+    pose = base_pos, base_quat = 100.0 * torch.rand(N, 3) - 30.0, torch.nn.functional.normalize(torch.randn(N, 4), dim=1)
+    parts = pair(lambda kernels: HeightScan(TerrainConfig(scan=scan), terrain, pose, kernels))
     base_pos[1, 0], base_pos[2, 1], base_quat[3] = torch.nan, torch.inf, torch.nan
     for part in parts:
-        part.update(base_pos, base_quat)
+        part.update()
     # Where a point lies on the border of two cells, sines of two libraries may put it into either.
     same = torch.cat([parts[0].heights == parts[1].heights, (parts[0].ground == parts[1].ground).unsqueeze(1)], dim=1)
     assert same.float().mean() > 0.999
@@ -208,8 +208,8 @@ def varying(*names, when="interval"):
 class NoPhysics:
     """What the parts below ask of an engine."""
 
-    def __init__(self, kernels) -> None:
-        self.kernels, self.forces, self.pushed = kernels, torch.zeros(N, 3, 6), torch.zeros(N, 6)
+    def __init__(self) -> None:
+        self.forces, self.pushed = torch.zeros(N, 3, 6), torch.zeros(N, 6)
         self.model = SimpleNamespace(jnt_bodyid=[1])
 
     def push(self, mask, delta):
@@ -229,10 +229,10 @@ def test_numbers_are_drawn_again_alike(chosen):
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(RandomPool(N, CPU))
-        engines.append(NoPhysics(kernels))
+        engines.append(NoPhysics())
         parts.append(Randomization(ranges, N, CPU))
         parts[-1].widen(dict.fromkeys(ranges, 3))
-        parts[-1].prepare(engines[-1], numbers[-1], DT, 24)
+        parts[-1].prepare(engines[-1], numbers[-1], DT, 24, kernels)
     for step in range(20):
         reset = chance(0.1, N)
         for part, drawn, engine in zip(parts, numbers, engines, strict=True):
@@ -296,8 +296,8 @@ def test_kicks_and_forces_come_and_end_alike(of):
     for kernels in (None, TaskKernels(nullcontext)):
         torch.manual_seed(3)
         numbers.append(RandomPool(N, CPU))
-        engines.append(NoPhysics(kernels))
-        parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1]))
+        engines.append(NoPhysics())
+        parts.append(Disturbances(cfg, engines[-1], DT, 24, numbers[-1], kernels))
     kicked = 0
     for step in range(40):
         mask = chance(0.9, N)
@@ -336,7 +336,7 @@ def test_maps_go_wrong_alike(errors):
     for kernels in (None, TaskKernels(nullcontext)):
         numbers.append(RandomPool(N, CPU))
         pose = (torch.zeros(N, 3), torch.zeros(N, 4))
-        scan = HeightScan(cfg, None, N, CPU, kernels)
+        scan = HeightScan(cfg, None, pose, kernels)
         maps.append(HeightMapErrors(HeightMapConfig(**errors), scan, pose, torch.neg, DT, numbers[-1], kernels))
     for step in range(5):
         begun = chance(1.0 if step == 0 else 0.3, N)

@@ -1,16 +1,16 @@
 """Kernels for the parts of a task that have a fixed formula. Each kernel replaces 6 to 20 torch operations by one launch.
 
-With the C engine, the same formulas run in torch (`legged/mdp/`). A test checks that kernels and torch give identical bits.
+With the C engine, the same formulas run in torch. A test checks that kernels and torch give identical bits.
 """
 
 import torch
 import warp as wp
 from torch import Tensor
 
-from legged.physics.warp.actuator_kernels import drive_joints
-from legged.physics.warp.launcher import Launcher
-from legged.physics.warp.network_kernels import run_lstm, run_mlp
-from legged.physics.warp.random_kernels import (
+from legged.mdp.kernels.actuator import drive_joints
+from legged.mdp.kernels.bodies import read_bodies
+from legged.mdp.kernels.network import run_lstm, run_mlp
+from legged.mdp.kernels.random import (
     advance_map,
     disturb,
     find_moments,
@@ -19,6 +19,7 @@ from legged.physics.warp.random_kernels import (
     take_fresh,
     vary_control,
 )
+from legged.physics.warp.launcher import Launcher
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -325,10 +326,6 @@ def add_rewards(
 class TaskKernels(Launcher):
     """Launches task kernels on an engine's device, in torch's current stream. All array arguments are torch tensors."""
 
-    def name_module(self) -> None:
-        """Launch one kernel of this file, so that the dry run of `compile_ahead` finds the file's Warp module."""
-        wp.launch(hold_joints, dim=1)
-
     def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
         """Launch the kernel of `Control.compute` for joints under PD control. The last argument receives the result."""
         self.launch(hold_joints, dim, arguments)
@@ -400,6 +397,10 @@ class TaskKernels(Launcher):
         """Launch the kernel of `HeightScan.update`."""
         dim = (len(base_pos), len(points_x))
         self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
+
+    def read_bodies(self, pos: Tensor, *arguments: Tensor) -> None:
+        """Launch the kernel of `BodyStates.update`. The first six arguments are vectors."""
+        self.launch(read_bodies, tuple(pos.shape[:2]), (pos, *arguments), vectors=6)
 
     def move_levels(self, *arguments: Tensor | float) -> None:
         """Launch the kernel of `TerrainCurriculum.update`. The caller sums the last argument (`judged`) over robots."""

@@ -1,5 +1,5 @@
 """Kernel of actuators with friction, delay and a torque-speed curve. For the same formulas in torch, and for their sources,
-see legged/mdp/actuator.py.
+see legged/mdp/actuators/.
 
 The kernel has a separate module, so that training with ideal motors does not compile it.
 """

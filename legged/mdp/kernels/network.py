@@ -1,4 +1,4 @@
-"""Learned actuators in one launch per physics step. legged/mdp/actuator_network.py has the description and the torch code.
+"""Learned actuators in one launch per physics step. legged/mdp/actuators/network.py has the description and the torch code.
 
 Each thread computes one joint of one robot. The network's units lie in a column of `scratch`, so that neighbouring threads
 read adjacent numbers.

@@ -7,13 +7,14 @@ from torch import Tensor
 
 from legged.config.schema import TerrainConfig
 from legged.math import yaw_of
+from legged.mdp.sensors.sensor import Sensor
 from legged.terrain.terrain import Terrain
 
 if TYPE_CHECKING:
-    from legged.physics.warp.task_kernels import TaskKernels
+    from legged.mdp.kernels.task import TaskKernels
 
 
-class HeightScan:
+class HeightScan(Sensor):
     """Ground heights at a grid of P points around each robot. The grid turns with the robot's heading. On a plane all heights
     are 0.
 
@@ -21,20 +22,19 @@ class HeightScan:
     (`HeightMap.scan_map`). The height of the ground under the base is looked up in the same way.
     """
 
-    STATE: tuple[str, ...] = ()  # nothing to save: heights follow from the robots' poses
-
     def __init__(
         self,
         cfg: TerrainConfig,
         terrain: Terrain | None,
-        num_envs: int,
-        device: torch.device,
+        pose: tuple[Tensor, Tensor],
         kernels: "TaskKernels | None" = None,
     ) -> None:
         """Build the grid of cfg.measured_points_x by cfg.measured_points_y, with x changing slowest. Without `terrain` the
-        ground is a plane.
+        ground is a plane. `pose` has the bases' positions (N, 3) [m] and orientations (N, 4) in the world frame, which
+        `update` reads.
         """
-        self._on_plane, self._kernels = terrain is None, kernels
+        self._on_plane, self._kernels, self._pose = terrain is None, kernels, pose
+        num_envs, device = len(pose[0]), pose[0].device
         x = torch.tensor(cfg.measured_points_x, device=device)
         y = torch.tensor(cfg.measured_points_y, device=device)
         self.points = torch.cartesian_prod(x, y)
@@ -53,7 +53,10 @@ class HeightScan:
             # Coordinates in cells. The last point is the base's position, so the same lookup finds the ground under the base.
             self._x, self._y = (torch.cat([self.points, torch.zeros(1, 2, device=device)]) / ground.cell).T.contiguous()
 
-    def update(self, base_pos: Tensor, base_quat: Tensor) -> None:
+    def update(self) -> None:
+        self.look_from(*self._pose)
+
+    def look_from(self, base_pos: Tensor, base_quat: Tensor) -> None:
         """Update the heights for bases at positions (N, 3) and orientations (N, 4) in the world frame. Points outside the map
         have the height at its border.
         """
