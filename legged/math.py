@@ -98,6 +98,12 @@ def quat_conjugate(quat: Tensor) -> Tensor:
     return torch.cat([_w_first(quat)[..., :1], -quat[..., 1:]], dim=-1)
 
 
+def quat_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Return the angles in [0, pi] between orientations `a` and `b` (..., 4), of any order of components, (...) [rad]."""
+    apart = torch.minimum((a - b).norm(dim=-1), (a + b).norm(dim=-1))
+    return 4.0 * torch.asin((0.5 * apart).clamp(max=1.0))
+
+
 def wrap_to_pi(angle: Tensor) -> Tensor:
     """Return the same angle in [-pi, pi) [rad]."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

@@ -41,6 +41,7 @@ __all__ = [
 YAML_ENDINGS = (".yaml", ".yml")
 CLASSES = {
     "LeggedRobot": "legged.envs.legged_robot",
+    "MotionTracking": "legged.envs.motion_tracking",
     "HalfCheetah": "legged.envs.half_cheetah",
     "Humanoid": "legged.envs.humanoid",
 }

@@ -182,6 +182,7 @@ def _merged(
             if "robot" in section:
                 section["robot"] = robot_path(section["robot"], layer.folder)
             actuator_path(section, layer.folder)
+            motion_paths(section, layer.folder)
         parts.append((layer, data))
     if robot is None:
         asked = [data.get("cpu", {}).get("robot") for _, data in parts if on_cpu], [data.get("robot") for _, data in parts]
@@ -265,6 +266,19 @@ def actuator_path(section: Any, folder: Path) -> None:
         section["network"] = str((folder / name if exists(folder / name) else Path.cwd() / name).absolute())
 
 
+def motion_paths(section: Any, folder: Path) -> None:
+    """Make the paths of reference motions in `section` absolute, as `actuator_path` does. A path that exists in neither
+    folder is looked for in resources/motions.
+    """
+    motion = section.get("motion") if isinstance(section, Mapping) else None
+    files = motion.get("files") if isinstance(motion, dict) else None
+    if isinstance(motion, dict) and isinstance(files, list) and all(isinstance(name, str) for name in files):
+        places = (folder, Path.cwd(), data_folder("resources") / "motions")
+        for i, name in enumerate(files):
+            found = next((place / name for place in places if exists(place / name)), folder / name)
+            motion["files"][i] = str(found.absolute())
+
+
 def parse_override(text: str) -> tuple[str, Any]:
     """Return `a.b=1e-3` as ("a.b", 0.001). The value is read as YAML.
 
@@ -328,6 +342,7 @@ def _merge_overrides(
         layer = renamed(layer, "command line")
         build(schema, layer, "", Origins(), "command line")
         actuator_path(layer, Path.cwd())
+        motion_paths(layer, Path.cwd())
         merge(data, layer, "command line", origins)
 
 

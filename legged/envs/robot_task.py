@@ -233,8 +233,12 @@ class RobotTask(RobotTerms, BaseTask):
         super().advance()
         self.contacts.update(self.contact_forces[:, self._feet_shapes])
 
-    def reset_idx(self, mask: Tensor) -> None:
+    def place(self) -> None:
+        """Hook: write the positions of the bases at the beginning of the next episodes to `reset_qpos`."""
         torch.add(self.env_origins, self._spawn.values, out=self.reset_qpos[:, :3])
+
+    def reset_idx(self, mask: Tensor) -> None:
+        self.place()
         super().reset_idx(mask)
         self.control.reset(mask)  # `control` reads angles that `redraw` may change, so its reset comes last
 

@@ -15,6 +15,8 @@ from legged.process.paths import relative
 
 ROOT = 7
 """Columns of the root: position and quaternion."""
+READERS = (".csv", ".npz", ".onnx")
+"""Endings of the files that can be read."""
 CSV_FPS = 30.0
 """Frames per second of a csv file, which does not say."""
 
@@ -26,18 +28,37 @@ def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
     Raises:
         ConfigError: the file can't be read, or does not fit the robot.
     """
-    where, readers = relative(path), {".csv": _read_csv, ".npz": _read_npz, ".onnx": _read_onnx}
-    if path.suffix not in readers:
-        raise ConfigError(f"{where}: motions are read from {', '.join(readers)}")
+    where = relative(path)
+    if path.suffix not in READERS:
+        raise ConfigError(f"{where}: motions are read from {', '.join(READERS)}")
     try:
         if path.suffix == ".csv":
             return _read_csv(path, skeleton, where, csv_fps)
-        return readers[path.suffix](path, skeleton, where)
+        return _read_npz(path, skeleton, where) if path.suffix == ".npz" else _read_onnx(path, skeleton, where)
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise ConfigError(f"{where}: can't be read as a motion ({error})") from error
 
 
-def _read_csv(path: Path, skeleton: Skeleton, where: str, fps: float = CSV_FPS) -> Clip:
+def read_clips(paths: Sequence[Path], skeleton: Skeleton, csv_fps: float, where: str) -> list[Clip]:
+    """Read the motions in some files and folders. Error messages about missing ones begin with `where`.
+
+    Raises:
+        ConfigError: there is no motion, or a file can't be read or does not fit the robot.
+    """
+    files: list[Path] = []
+    for path in paths:
+        found = sorted(file for file in path.rglob("*") if file.suffix in READERS) if path.is_dir() else [path]
+        if not found or not found[0].is_file():
+            raise ConfigError(
+                f"{where}: {relative(path)} is no file of a motion, and no folder with one ({', '.join(READERS)})"
+            )
+        files += found
+    if not files:
+        raise ConfigError(f"{where}: name at least one file of a motion ({', '.join(READERS)})")
+    return [read_clip(file, skeleton, csv_fps) for file in files]
+
+
+def _read_csv(path: Path, skeleton: Skeleton, where: str, fps: float) -> Clip:
     rows = np.loadtxt(path, delimiter=",", ndmin=2)
     _check_width(rows, ROOT + len(skeleton.robot.joint_names), where)
     return make_clip(path.stem, fps, rows[:, :3], rows[:, [6, 3, 4, 5]], rows[:, ROOT:], where)
