@@ -13,6 +13,7 @@ from legged.cli.main import hint_at_sub_command
 from legged.commandline.arguments import POLICY, measuring_device, policy_overrides, register_given, velocity_command
 from legged.commandline.command import sub_command
 from legged.config import follows_velocities
+from legged.config.tracking import tracks_motions
 from legged.deploy.command_parser import Argument, argument, check_between, check_number
 from legged.errors import ConfigError, suggest
 from legged.evaluation.episodes import MOST_EPISODES, evaluate_episodes, evaluate_in_gymnasium
@@ -25,6 +26,7 @@ from legged.evaluation.following import (
     evaluate_following,
 )
 from legged.evaluation.measurement import Setting
+from legged.evaluation.motions import evaluate_motions
 from legged.evaluation.playback import SETTLING_S, follow, play
 from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.disturbances import NAMES
@@ -44,6 +46,8 @@ MOST_SIZES = 16
 """Number of terrain sizes that can be simulated at once with the largest allowed value of --robots-per-point."""
 ENVIRONMENTS = 256
 """Default number of episodes; each runs in a separate environment."""
+STARTS = 1024
+"""Default number of episodes of each motion."""
 IN_GYMNASIUM = 20
 """Default number of episodes in Gymnasium's environment."""
 EVALUATED = (
@@ -125,9 +129,10 @@ def evaluate(args: argparse.Namespace) -> int:
     """Measure a policy: `legged evaluate anymal_c_flat`.
 
     A policy that follows velocity commands is measured on a grid of commands, as in `legged evaluate grid`. If the policy was
-    trained on terrain, its success on terrain is measured too, as in `legged evaluate terrain`. A policy without velocity
-    commands is measured as in `legged evaluate episodes`. ONNX files and exported folders are measured as in
-    `legged evaluate onnx`. Tables are printed. Results of a checkpoint are written to evaluation_<physics>.json and pictures.
+    trained on terrain, its success on terrain is measured too, as in `legged evaluate terrain`. A policy that tracks motions
+    is measured as in `legged evaluate motions`, and any other policy as in `legged evaluate episodes`. ONNX files and
+    exported folders are measured as in `legged evaluate onnx`. Tables are printed. Results of a checkpoint are written to
+    evaluation_<physics>.json, or to motions_<physics>.json, and pictures.
     """
     if _exported_file(args.policy) is not None:
         _check_plain(args)
@@ -135,6 +140,8 @@ def evaluate(args: argparse.Namespace) -> int:
     with hint_at_sub_command("evaluate", [args.policy]):
         setting = _settle(args, follows=False)
     cfg = setting.policy.cfg
+    if tracks_motions(cfg):
+        return evaluate_motions(setting, STARTS)
     if not follows_velocities(cfg):
         return evaluate_episodes(setting, ENVIRONMENTS)
     sizes = chosen_sizes(cfg, None, False, setting.cfg.terrain.scale)
@@ -275,6 +282,25 @@ def episodes(args: argparse.Namespace) -> int:
         task = setting.policy.cfg.task
         raise ConfigError(f"POLICY: '{task}' follows velocity commands; use `legged evaluate grid {task}`")
     return evaluate_episodes(setting, args.episodes)
+
+
+@sub_command(
+    "legged evaluate motions g1_tracking",
+    "legged evaluate motions g1_tracking --physics mujoco motion.files=[clips/dance.npz]",
+    arguments=(*EVALUATED, _episodes(STARTS)),
+)
+def motions(args: argparse.Namespace) -> int:
+    """Measure how well a policy tracks motions: `legged evaluate motions g1_tracking`.
+
+    Robots begin in random frames of each motion. An episode succeeds if it lasts 10 s without a failure. One more robot
+    begins in the first frame and has to reach the last one. Success and errors are printed, and written to
+    motions_<physics>.json.
+    """
+    check_number("--episodes", args.episodes, 1, MOST_EPISODES)
+    setting = _settle(args, follows=False)
+    if not tracks_motions(setting.policy.cfg):
+        raise ConfigError(f"POLICY: '{setting.policy.cfg.task}' tracks no motions; use `legged evaluate`")
+    return evaluate_motions(setting, args.episodes)
 
 
 @sub_command(

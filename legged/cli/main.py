@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "evaluate stress": ("legged.cli.evaluate:stress", "success under disturbances and on unknown ground"),
     "evaluate checkpoints": ("legged.cli.evaluate:checkpoints", "search a run for its first checkpoint that walks"),
     "evaluate episodes": ("legged.cli.evaluate:episodes", "returns and lengths of episodes, for tasks without commands"),
+    "evaluate motions": ("legged.cli.evaluate:motions", "success and errors of a policy that tracks motions"),
     "evaluate gymnasium": ("legged.cli.evaluate:gymnasium", "returns in Gymnasium's own environment"),
     "evaluate onnx": ("legged.cli.evaluate:onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
     "runs": ("legged.cli.runs:runs", "all runs in one table (the same as `runs table`)"),

@@ -6,6 +6,7 @@ Code that treats some tasks differently asks for one of these capabilities, and 
 |---|---|---|
 | a robot: joints with a control law, feet, and a ground that `terrain` sets | `has_robot` | `is_robot_task` |
 | robots can be steered by velocity commands | `follows_velocities` | `is_velocity_task` |
+| robots track reference motions | `tracking.tracks_motions` | `MotionTracking` |
 | the ground has tiles, on which robots can be placed | `terrain.mesh_type` | `terrain_curriculum` |
 | switches that a measurement sets to false | `DISTURBANCES` | |
 """

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config.task import TaskConfig
@@ -20,8 +21,12 @@ from legged.mdp.reference_motion import ReferenceMotion
 from legged.mdp.sensors import BodyStates, Sensor
 from legged.motion.clip import Clip
 from legged.motion.kinematics import Skeleton
-from legged.motion.readers import read_clips
+from legged.motion.readers import motion_files, read_clip
 from legged.robots.robot import load_robot
+
+ERRORS = ("world_error", "body_error", "extremity_error", "joint_error")
+"""Mean distances of bodies from their places in the world, and of bodies and extremities from their places relative to the
+anchor [m]; the root mean square error of the joint angles [rad]."""
 
 
 class MotionTracking(RobotTask):
@@ -74,6 +79,8 @@ class MotionTracking(RobotTask):
         self.target_pos = torch.zeros_like(self.bodies.pos)
         """(N, B, 3) positions of the reference's bodies, moved to the robot [m]; `target_quat` (N, B, 4) are orientations."""
         self.target_quat = torch.zeros_like(self.bodies.quat)
+        self.errors = torch.zeros(self.num_envs, len(ERRORS), device=device)
+        """(N, 4) errors of the step, before resets, in the order of `ERRORS`."""
 
     # ---- hooks of a control step -------------------------------------------------------------------------------------
 
@@ -102,6 +109,10 @@ class MotionTracking(RobotTask):
         start = torch.cat([bodies.pos[:, anchor, :2], now.pos[:, anchor, 2:]], dim=1).unsqueeze(1)
         torch.add(start, quat_rotate(heading, now.pos - now.pos[:, anchor : anchor + 1]), out=self.target_pos)
         self.target_quat.copy_(quat_multiply(heading, now.quat))
+        world, moved = ((pos - bodies.pos).norm(dim=2) for pos in (now.pos, self.target_pos))
+        joint = (now.joint_pos - self.dof_pos).square().mean(dim=1).sqrt()
+        extremity = moved[:, self._extremities].mean(dim=1)
+        torch.stack([world.mean(dim=1), moved.mean(dim=1), extremity, joint], dim=1, out=self.errors)
 
     def update_curricula(self) -> None:
         self.motion.count(self.terminated_buf)
@@ -112,6 +123,13 @@ class MotionTracking(RobotTask):
 
     def ask(self) -> None:
         self.motion.advance()
+
+    def start_at(self, frames: Tensor) -> TensorDict:
+        """Begin an episode of each robot in `frames` (N,), rows of `motion.table`. Return the observations."""
+        self.motion.chosen = frames
+        observations = self.reset()
+        self.motion.chosen = None
+        return observations
 
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "motion": self.motion}
@@ -221,15 +239,21 @@ class MotionTracking(RobotTask):
 
     @concurrent
     @unit("m")
-    def _metric_body_error(self) -> Tensor:
-        """Mean distance of the bodies from their places relative to the anchor [m]."""
-        return (self.target_pos - self.bodies.pos).norm(dim=2).mean(dim=1)
+    def _metric_world_error(self) -> Tensor:
+        """Mean distance of the bodies from their places in the world [m]."""
+        return self.errors[:, 0]
 
     @concurrent
     @unit("m")
-    def _metric_world_error(self) -> Tensor:
-        """Mean distance of the bodies from their places in the world [m]."""
-        return (self.motion.now.pos - self.bodies.pos).norm(dim=2).mean(dim=1)
+    def _metric_body_error(self) -> Tensor:
+        """Mean distance of the bodies from their places relative to the anchor [m]."""
+        return self.errors[:, 1]
+
+    @concurrent
+    @unit("rad")
+    def _metric_joint_error(self) -> Tensor:
+        """Root mean square error of the joint angles [rad]."""
+        return self.errors[:, 3]
 
     def _anchor_quats(self) -> tuple[Tensor, Tensor]:
         return self.motion.now.quat[:, self._anchor], self.bodies.quat[:, self._anchor]
@@ -238,5 +262,5 @@ class MotionTracking(RobotTask):
 def _clips(cfg: TrackingConfig) -> list[Clip]:
     """Return the clips of a task, at its control rate."""
     motion, skeleton = cfg.motion, Skeleton(load_robot(cfg.robot))
-    clips = read_clips([Path(name) for name in motion.files], skeleton, motion.csv_fps, cfg.origins.where("motion.files"))
-    return [clip.resampled(round(1.0 / cfg.dt, 6)) for clip in clips]
+    files = motion_files([Path(name) for name in motion.files], cfg.origins.where("motion.files"))
+    return [read_clip(file, skeleton, motion.csv_fps).resampled(round(1.0 / cfg.dt, 6)) for file in files]

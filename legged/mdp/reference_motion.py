@@ -80,6 +80,8 @@ class ReferenceMotion:
         """The frame of each robot."""
         self.start = Frames(torch.zeros(n, width, device=device), joints, len(bodies))
         """The frame in which each robot's next episode begins."""
+        self.chosen: Tensor | None = None
+        """(N,) rows in which the next episodes begin instead of the drawn ones; None outside `MotionTracking.start_at`."""
         self._numbers = numbers.between(0.0, 1.0, 2)
 
     def chances(self) -> Tensor:
@@ -91,7 +93,7 @@ class ReferenceMotion:
         """Draw the frame in which each robot's next episode begins."""
         which, where = self._numbers.values.unbind(dim=1)
         bins = torch.searchsorted(self.chances().cumsum(0), which.contiguous()).clamp_(max=len(self.failures) - 1)
-        self.drawn.copy_(self._starts[bins] + where * self._spans[bins])
+        self.drawn.copy_(self._starts[bins] + where * self._spans[bins] if self.chosen is None else self.chosen)
         torch.index_select(self.table.rows, 0, self.drawn, out=self.start.rows)
 
     def begin(self, mask: Tensor) -> None:

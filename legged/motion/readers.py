@@ -39,11 +39,11 @@ def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
         raise ConfigError(f"{where}: can't be read as a motion ({error})") from error
 
 
-def read_clips(paths: Sequence[Path], skeleton: Skeleton, csv_fps: float, where: str) -> list[Clip]:
-    """Read the motions in some files and folders. Error messages about missing ones begin with `where`.
+def motion_files(paths: Sequence[Path], where: str) -> list[Path]:
+    """Return the files of motions among `paths`, and those in the folders among them. Error messages begin with `where`.
 
     Raises:
-        ConfigError: there is no motion, or a file can't be read or does not fit the robot.
+        ConfigError: there is no motion, or a path is neither a file nor a folder with one.
     """
     files: list[Path] = []
     for path in paths:
@@ -55,7 +55,7 @@ def read_clips(paths: Sequence[Path], skeleton: Skeleton, csv_fps: float, where:
         files += found
     if not files:
         raise ConfigError(f"{where}: name at least one file of a motion ({', '.join(READERS)})")
-    return [read_clip(file, skeleton, csv_fps) for file in files]
+    return files
 
 
 def _read_csv(path: Path, skeleton: Skeleton, where: str, fps: float) -> Clip:

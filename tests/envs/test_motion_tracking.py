@@ -1,5 +1,6 @@
 """Motion tracking: terms by numbers worked out elsewhere, frames and bins by hand, a training through the commands."""
 
+import json
 import math
 from pathlib import Path
 
@@ -195,6 +196,28 @@ def test_bins_with_failures_are_drawn_more_often():
     assert motion.chances().tolist() == pytest.approx(wanted, abs=1e-5)
 
 
+def test_episodes_begin_in_chosen_frames():
+    quiet = {"motion.pose_noise": [0.0] * 6, "motion.velocity_noise": [0.0] * 6, "motion.joint_noise": [0.0, 0.0]}
+    task = tracking(wave(), count=3, **quiet)
+    frames = torch.tensor([0, 40, 99])
+    task.start_at(frames)
+    assert torch.equal(task.motion.frame, frames + 1)
+    torch.testing.assert_close(task.bodies.pos, task.motion.table.pos[frames], atol=2e-5, rtol=0.0)
+    task.reset()
+    assert not torch.equal(task.motion.frame, frames + 1)
+
+
+def test_errors_are_those_of_a_displaced_robot():
+    """0.3 m along x: only the error in the world. One knee bent by 0.1 rad: the root mean square over 29 joints."""
+    task = tracking(still())
+    put(task, (0.3, 0.0, HEIGHT))
+    assert task.errors[0].tolist() == pytest.approx([0.3, 0.0, 0.0, 0.0], abs=1e-6)
+    joints = task.default_dof_pos.clone()
+    joints[3] += 0.1
+    put(task, joints=joints)
+    assert float(task.errors[0, 3]) == pytest.approx(0.1 / math.sqrt(29), abs=1e-6)
+
+
 def test_draws_have_their_chances_and_stay_in_the_clips():
     task = tracking(wave(), still(), count=4000, **{"sim.physics": "mujoco"})
     motion = task.motion
@@ -217,6 +240,15 @@ def test_a_tracker_is_trained_and_plays(capsys):
     assert main(["train", "g1_tracking", "--max-iterations", "2", "--sim-device", "cpu", *small]) == 0
     assert "finished after 2 iterations" in capsys.readouterr().out
     assert main(["play", "g1_tracking", "--headless", "--no-video", "--sim-device", "cpu", "--num-envs", "4"]) == 0
+    assert main(["evaluate", "motions", "g1_tracking", "--physics", "mujoco", "--episodes", "16", "--out", "."]) == 0
+    found = json.loads(Path("motions_mujoco.json").read_text())
+    assert list(found["motions"]) == ["walk", "turn", "squat", "kick"]
+    squat = found["motions"]["squat"]
+    assert squat["episodes"] == sum(part["episodes"] for part in squat["by_second"]) == 16
+    assert squat["share"] == squat["successes"] / 16 < 0.5  # it has hardly learned anything
+    assert 0.0 < squat["whole"]["lasted_s"] < squat["seconds"]
+    assert squat["seconds"] == pytest.approx(276 / 50)
+    assert 0.0 < squat["body_error"] < squat["world_error"] < 1.0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,122 @@
+"""Evaluation of policies that track motions: success and errors of each motion, with intervals."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from legged.envs.motion_tracking import ERRORS, MotionTracking
+from legged.evaluation.intervals import wilson
+from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
+from legged.evaluation.result_file import write_result
+from legged.motion.readers import motion_files
+from legged.policies.episodes import Policy
+from legged.policies.restore import restore, undisturbed
+from legged.process.paths import relative
+from legged.tables import screen_table
+
+SUCCESS_S = 10.0
+"""An episode succeeds if no failure ends it within this time [s]. At the end of its motion, a robot begins anew."""
+
+
+def motions_name(physics: str) -> str:
+    """Return the name of the file with the result in an engine."""
+    return f"motions_{physics}.json"
+
+
+def evaluate_motions(setting: Setting, episodes: int) -> int:
+    """Measure each motion of a task: `episodes` robots begin in frames drawn uniformly, and one robot in the first frame.
+    Nothing is random besides these frames. Print a table, write motions_<physics>.json, and return the exit code.
+
+    Raises:
+        ConfigError: a motion can't be read.
+        RunError: the file can't be written.
+    """
+    start, cfg = time.perf_counter(), setting.cfg
+    head = {**setting.head, **setting.changes}
+    exact: list[tuple[str, Any]] = [
+        ("motion.memory", 0.0),  # all bins stay equally likely
+        ("motion.pose_noise", [0.0] * 6),
+        ("motion.velocity_noise", [0.0] * 6),
+        ("motion.joint_noise", [0.0, 0.0]),
+    ]
+    measured, lost = {}, 0
+    for file in motion_files([Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files")):
+        changes = [
+            *undisturbed(setting.policy.cfg, episodes, SUCCESS_S),
+            *exact,
+            *setting.asked,
+            ("motion.files", [str(file)]),
+        ]
+        task, act = restore(setting.policy, changes, setting.device, setting.graph)
+        overflows = Overflows()
+        measured[file.stem] = {**_from_anywhere(task, act, overflows), "whole": _from_the_beginning(task, act)}
+        lost += overflows.total(task)
+    result = {**head, "wall_s": time.perf_counter() - start, "success_s": SUCCESS_S, "motions": measured}
+    Console(width=140).print(_table(result))
+    path = setting.folder / motions_name(result["physics"])
+    write_result(path, result)
+    print(f"written: {relative(path)}")
+    warn_of_overflows("motions", lost)
+    return 0
+
+
+@torch.inference_mode()
+def _from_anywhere(task: MotionTracking, act: Policy, overflows: Overflows) -> dict[str, Any]:
+    """Return success and mean errors of robots that begin in random frames, and success by the second of the beginning."""
+    observations = task.reset()
+    begun = task.motion.drawn.clone()
+    running = torch.ones_like(task.reset_buf)
+    errors, steps = torch.zeros_like(task.errors), torch.zeros_like(task.rew_buf)
+    for _ in range(round(SUCCESS_S / task.dt)):
+        observations, _, _, extras = task.step(act(observations))
+        overflows.add(extras)
+        errors += torch.where(running.unsqueeze(1), task.errors, 0.0)
+        steps += running
+        running &= ~task.terminated_buf
+    count, successes = task.num_envs, int(running.sum())
+    low, high = wilson(successes, count)
+    means = (errors / steps.unsqueeze(1)).mean(dim=0).tolist()
+    seconds = (begun * task.dt).long()
+    return {
+        "seconds": len(task.motion.table.rows) * task.dt,
+        "episodes": count,
+        "successes": successes,
+        "share": successes / count,
+        "low": low,
+        "high": high,
+        **dict(zip(ERRORS, means, strict=True)),
+        "by_second": [
+            {"second": second, "episodes": int(there.sum()), "successes": int((there & running).sum())}
+            for second in range(int(seconds.max()) + 1)
+            if (there := seconds == second).any()
+        ],
+    }
+
+
+@torch.inference_mode()
+def _from_the_beginning(task: MotionTracking, act: Policy) -> dict[str, Any]:
+    """Return whether a robot that begins in the first frame reaches the last one, and how long it lasts [s]."""
+    observations, last = task.start_at(torch.zeros_like(task.motion.frame)), len(task.motion.table.rows) - 1
+    for step in range(1, last + 1):
+        observations, *_ = task.step(act(observations))
+        if bool(task.terminated_buf[0]):
+            return {"success": False, "lasted_s": step * task.dt}
+    return {"success": True, "lasted_s": last * task.dt}
+
+
+def _table(result: dict[str, Any]) -> Table:
+    heads = ("motion", "length [s]", "success [%] (95 % interval)", "whole motion", "body error [m]", "in the world [m]")
+    rows = []
+    for name, found in result["motions"].items():
+        whole = found["whole"]
+        share, low, high = (100.0 * found[key] for key in ("share", "low", "high"))
+        errors = (f"{found[key]:.3f}" for key in ("body_error", "world_error", "extremity_error", "joint_error"))
+        lasted = "tracked" if whole["success"] else f"falls at {whole['lasted_s']:.1f} s"
+        rows.append([name, f"{found['seconds']:.1f}", f"{share:.1f} ({low:.1f} to {high:.1f})", lasted, *errors])
+    count = next(iter(result["motions"].values()))["episodes"]
+    title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}: {count} episodes of {SUCCESS_S:g} s a motion"
+    return screen_table(title, [*heads, "extremities [m]", "joints [rad]"], rows)
