@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+from legged.errors import ConfigError
+
 
 class Origins(dict[str, str]):
     """Map: dotted path -> source of its value, such as 'cfg/mine.yaml', 'cfg/mine.yaml: cpu' or 'command line'."""
@@ -33,3 +35,7 @@ class Origins(dict[str, str]):
     def where(self, path: str) -> str:
         """Return the prefix of an error message about `path`, such as 'cfg/mine.yaml: terrain.border_size'."""
         return f"{self.of(path)}: {path}"
+
+    def error(self, path: str, text: str) -> ConfigError:
+        """Return the error that the setting `path` is wrong. `text` gives the reason, the value and the allowed values."""
+        return ConfigError(f"{self.where(path)}: {text}")

@@ -102,7 +102,7 @@ def _fits(result: Translation, name: str) -> bool:
     """Return True if a terrain type fits on the fork's tiles. If not even `flat` fits, take the default tiles."""
     sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
     try:
-        check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
+        check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, ""), Origins())
     except ConfigError as error:
         if name != "flat":
             return False
