@@ -1,6 +1,5 @@
 """Registry of tasks: names, task classes and configurations. Every `cfg/*.yaml` is a task; users register their own."""
 
-import dataclasses
 import sys
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -13,7 +12,6 @@ import torch
 from legged.config import TaskConfig, load_config
 from legged.config.checks import PLAIN, is_plain_name, shown
 from legged.config.loader import Layer, Registered, Rescale, read_layers
-from legged.config.networks import groups_in
 from legged.config.rescale import rescale
 from legged.envs import BaseTask, LeggedRobot, RobotTask
 from legged.envs.marks import unit_of
@@ -201,37 +199,7 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     schema = _schema_of(kind)
     cfg = load_config(layers, name, overrides, on_cpu, schema, _rescaler(kind, schema))
     kind.check(cfg)
-    _check_units(kind, cfg)
     return cfg
-
-
-def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
-    """Check that every term whose number was rescaled from another robot declares its unit.
-
-    Raises:
-        ConfigError: a term in use has a rescaled number other than 0, but declares no unit.
-    """
-    running = {
-        "_reward_": set(cfg.rewards.scales),
-        "_obs_": {name for group in groups_in(cfg).values() for name in group.terms},
-    }
-    for section in ("rewards", "observations"):
-        for field in dataclasses.fields(getattr(cfg, section)):
-            prefix, _ = field.metadata.get("unit_of", ("", 1))
-            for name, number in getattr(getattr(cfg, section), field.name).items() if prefix in running else ():
-                path = f"{section}.{field.name}.{name}"
-                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.rescaled:
-                    continue
-                if unit_of(getattr(kind, prefix + name)) is None:
-                    parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
-                    example = next((unit for unit in parents if unit is not None), "m^2/s^2")
-                    raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, but"
-                        f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit. Write @unit("{example}") above the method, with the unit of its return value'
-                        ' (from legged import unit). For a value without a unit, write @unit("1"). A unit in the docstring is'
-                        " not read"
-                    )
 
 
 def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
@@ -243,7 +211,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without a unit
+        return unit_of(getattr(kind, name, None)) or "1"  # `check_terms` refuses terms without a unit
 
     def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, RobotTask):

@@ -41,13 +41,8 @@ task's robot."""
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
     """Merge `top` into `base` in place. Maps are merged key by key. A list or a scalar replaces the value in `base`. Record
-    `source` in `origins` as the source of each path.
-
-    Raises:
-        ConfigError: the maps are nested too deeply.
+    `source` in `origins` as the source of each path. `top` has been checked, so that its nesting is limited.
     """
-    if prefix.count(".") > DEEPEST:
-        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} nested sections")
     for key, value in top.items():
         path = f"{prefix}{plain_path(key)}"
         if isinstance(value, Mapping):
@@ -304,11 +299,12 @@ def from_dict(
     """Build an instance of `schema` from nested plain values. `origins` holds the sources of the values. Without
     `origins`, all values are from `source`.
     """
+    data = data if origins is not None else renamed(data, source)
+    cfg = build(schema, data, source, origins)
     if origins is None:
-        data = renamed(data, source)
         origins = Origins()
         merge({}, data, source, origins)
-    return dataclasses.replace(build(schema, data, source, origins), origins=origins)
+    return dataclasses.replace(cfg, origins=origins)
 
 
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:

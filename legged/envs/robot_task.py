@@ -10,7 +10,6 @@ from torch import Tensor
 
 from legged.config.schema import LeggedConfig, TaskConfig
 from legged.envs.base_task import BaseTask
-from legged.envs.class_checks import check_overrides
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms
 from legged.math import evenly_spaced, quat_rotate
@@ -58,11 +57,9 @@ class RobotTask(RobotTerms, BaseTask):
         Raises:
             ConfigError: the configuration is invalid for this task.
         """
-        check_overrides(cls)  # comes first, because a wrong override can make other checks fail
-        assert isinstance(cfg, LeggedConfig)
-        robot = load_robot(cfg.robot, cfg.origins.where("robot"))
         super().check(cfg)
-        check_legged(cls, cfg, robot)
+        assert isinstance(cfg, LeggedConfig)
+        check_legged(cfg, load_robot(cfg.robot, cfg.origins.where("robot")))
 
     # ---- construction ------------------------------------------------------------------------------------------------
 

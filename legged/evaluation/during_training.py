@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged.config import LeggedConfig, TaskConfig
+from legged.config import LeggedConfig
 from legged.envs import BaseTask
 from legged.envs.actions import ordinary_tensors
 from legged.envs.checks import evaluated_figures
@@ -164,13 +164,3 @@ class TrainingEvaluation:
             for name, errors in (("lin_vel_rmse", self._lin), ("ang_vel_rmse", self._ang)):
                 found[name] = (errors.view(-1, self._grid.robots).mean(dim=1) / measured).sqrt().mean()
         return {name: found[name] if name in found else own[name] for name in self.figures}
-
-
-def check_commands(cfg: TaskConfig) -> None:
-    """If evaluations during training are enabled, check that the configuration gives a grid of commands for them.
-
-    Raises:
-        ConfigError: an axis is not a range.
-    """
-    if cfg.train.runner.evaluate_interval and isinstance(cfg, LeggedConfig):
-        few_commands(cfg)

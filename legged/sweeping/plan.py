@@ -35,7 +35,7 @@ class ParameterConfig:
     """Greatest value."""
     log: bool = False
     """Sample uniformly on a logarithmic scale."""
-    choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True, "unique": True})
+    choices: tuple[Any, ...] = field(default=(), metadata=items(1000, {"may_be_empty": True, "unique": True}))
     """Values to try, in place of a range."""
 
 
@@ -62,7 +62,7 @@ class SweepConfig:
     """Folder under logs/; by default sweep_ followed by the name of the sweep's file."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
     """Number of trials of all processes together."""
-    seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
+    seeds: tuple[int, ...] = field(default=(1,), metadata=items(100, {**between(0, 2**62), "unique": True}))
     """Seeds of each trial. The value of a trial is the mean over its seeds."""
     objective: ObjectiveConfig = ObjectiveConfig()
     """The objective."""
