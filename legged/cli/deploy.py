@@ -14,7 +14,8 @@ import torch
 from legged.commandline.arguments import POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
 from legged.config import LeggedConfig, parse_override
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.legged import TerrainConfig
+from legged.config.world import SimConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
 from legged.deploy.contract import SCANS, Contract, read_contract
 from legged.deploy.pace import take_priority

@@ -8,8 +8,9 @@ import mujoco
 import torch
 
 from legged.config import TaskConfig, override
+from legged.config.legged import LeggedDomainRandConfig
 from legged.config.networks import groups_in
-from legged.config.schema import DrawConfig, LeggedDomainRandConfig
+from legged.config.randomization import DrawConfig
 from legged.envs import BaseTask, RobotTask
 from legged.mdp.control import action_scales
 from legged.mdp.distributions import standard_deviation

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from operator import attrgetter
 from typing import Any
 
-from legged.config.schema import ObservationGroupConfig, TaskConfig
+from legged.config.mdp import ObservationGroupConfig
+from legged.config.task import TaskConfig
 from legged.errors import suggest
 
 NETWORKS = ("actor", "critic")

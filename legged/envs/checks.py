@@ -4,8 +4,9 @@ from itertools import pairwise
 from operator import attrgetter
 from typing import Any, get_args
 
+from legged.config.legged import LeggedConfig
 from legged.config.networks import check_networks, groups_in, learns_from_teacher
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.task import TaskConfig
 from legged.envs.class_checks import check_class, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest

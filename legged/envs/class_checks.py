@@ -10,7 +10,7 @@ from types import CodeType
 from typing import Any
 
 from legged.config.networks import groups_in, path_of_terms
-from legged.config.schema import TaskConfig
+from legged.config.task import TaskConfig
 from legged.envs.marks import unit_of
 from legged.errors import LONGEST, ConfigError, suggest
 from legged.physics.quantities import check_quantities

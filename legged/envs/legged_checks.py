@@ -1,9 +1,9 @@
 """Checks of a legged robot's settings that are valid by themselves but may not fit each other or the robot."""
 
 from legged.config.checks import shown
+from legged.config.legged import LeggedConfig
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import draw_of
-from legged.config.schema import LeggedConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
 from legged.mdp.actuator import check_actuator, check_motor_model, check_slowest

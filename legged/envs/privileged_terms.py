@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged.config.legged import LeggedConfig
 from legged.config.randomization import DrawConfig, ForceConfig, draw_of
-from legged.config.schema import LeggedConfig
 from legged.envs.marks import unit
 from legged.errors import ConfigError
 from legged.mdp.mirror_images import MirrorKind

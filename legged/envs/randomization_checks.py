@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 
+from legged.config.legged import LeggedConfig
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import DrawConfig, Range, draw_of
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.task import TaskConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observed_forces
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import FIELDS

@@ -8,8 +8,9 @@ from typing import Any
 from torch import Tensor
 
 from legged.config import LeggedConfig, TaskConfig
+from legged.config.learning import PolicyConfig
+from legged.config.mdp import ObservationGroupConfig
 from legged.config.networks import groups_of
-from legged.config.schema import ObservationGroupConfig, PolicyConfig
 from legged.envs.privileged_terms import PREFIX as DRAWN
 from legged.envs.privileged_terms import largest_of, observed, observed_forces
 from legged.errors import ConfigError, suggest

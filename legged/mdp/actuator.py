@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged.config.actuator import ActuatorConfig
+from legged.config.legged import LeggedControlConfig
 from legged.config.origins import Origins
-from legged.config.schema import ActuatorConfig, LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator_network import ActuatorNetwork, NetworkWeights

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.schema import LeggedControlConfig
+from legged.config.legged import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuator import Actuator, is_ideal

@@ -3,7 +3,8 @@
 import torch
 from torch import Tensor
 
-from legged.config.schema import DrawConfig, ForceConfig, KickConfig, LeggedDomainRandConfig
+from legged.config.legged import LeggedDomainRandConfig
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from legged.config.legged import LeggedDomainRandConfig
 from legged.config.randomization import DrawConfig, Range, draw_of
-from legged.config.schema import LeggedDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool

@@ -5,8 +5,8 @@ from typing import Any
 
 from legged.config.checks import build
 from legged.config.dotted import value_at
+from legged.config.legged import STATE_TERMS, TerrainConfig
 from legged.config.origins import Origins
-from legged.config.schema import STATE_TERMS, TerrainConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.migration import tables

@@ -7,8 +7,8 @@ from typing import Any
 
 from legged.config.checks import build, shown
 from legged.config.dotted import value_at
+from legged.config.legged import LeggedConfig
 from legged.config.loader import nest, to_dict
-from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
 from legged.migration.reading import Found
 

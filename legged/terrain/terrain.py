@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
+from legged.config.legged import TerrainConfig
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError
 from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap

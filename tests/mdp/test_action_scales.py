@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import small_task
 
-from legged.config.schema import LeggedControlConfig
+from legged.config.legged import LeggedControlConfig
 from legged.errors import ConfigError
 from legged.learning.runner import Runner
 from legged.mdp.control import Control

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, LeggedControlConfig
+from legged.config.legged import CommandCurriculumConfig, CommandRanges, CommandsConfig, LeggedControlConfig
 from legged.errors import TermError
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands

@@ -10,7 +10,7 @@ from helpers import small_config, small_task
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.legged import LeggedControlConfig
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.mdp.actuator import MotorCurve, check_actuator, with_rotors
 from legged.physics.scene.robot_scene import RobotScene, robot_source

@@ -9,7 +9,8 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config.schema import LeggedControlConfig, SimConfig
+from legged.config.legged import LeggedControlConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics

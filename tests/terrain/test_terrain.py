@@ -6,9 +6,9 @@ from itertools import product
 import numpy as np
 import pytest
 
+from legged.config.legged import TerrainConfig
 from legged.config.loader import merge
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec, check_terrain, tile_size
 from legged.terrain.height_map import CORNERS, join

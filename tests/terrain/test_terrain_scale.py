@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from legged.config.legged import TerrainConfig
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
 from legged.errors import ConfigError
 from legged.evaluation.success import sizes_of
 from legged.registry import task_config
