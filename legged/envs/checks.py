@@ -2,15 +2,14 @@
 
 from itertools import pairwise
 from operator import attrgetter
-from typing import Any, get_args
+from typing import Any
 
 from legged.config.legged import LeggedConfig
-from legged.config.networks import check_networks, groups_in, learns_from_teacher
+from legged.config.networks import check_networks, learns_from_teacher
 from legged.config.task import TaskConfig
 from legged.envs.class_checks import check_class, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
-from legged.mdp.mirror_images import MirrorKind
 
 FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
 """Figures that evaluations during training report for robots that follow commands. By default, the first one decides which
@@ -35,8 +34,9 @@ def check_task(cls: Any, cfg: TaskConfig) -> None:
     """
     check_class(cls)
     check_terms(cls, cfg)
-    if cfg.train.algorithm.symmetry:
-        check_mirrored(cls, cfg)
+    if cfg.train.algorithm.symmetry and not hasattr(cls, "MIRRORED"):
+        text = f"{cls.__name__} has no mirror images (table MIRRORED); set symmetry to false"
+        raise cfg.origins.error("train.algorithm.symmetry", text)
     check_networks(cfg)
     check_randomization(cfg)
     check_observed(cfg)
@@ -118,23 +118,3 @@ def check_sizes(cfg: TaskConfig) -> None:
         weights = sum(a * b for a, b in pairwise(attrgetter(field)(cfg.train.policy)))
         if weights > MOST_WEIGHTS:
             raise error(f"train.policy.{field}", f"these widths make {weights:,} weights, more than {MOST_WEIGHTS:,}")
-
-
-def check_mirrored(cls: Any, cfg: TaskConfig) -> None:
-    """Check that the class says how the observations are mirrored, in its table MIRRORED.
-
-    Raises:
-        ConfigError: there is no such table, or an observation in use has no kind or an unknown kind.
-    """
-    path, task, kinds = "train.algorithm.symmetry", cls.__name__, get_args(MirrorKind)
-    if not hasattr(cls, "MIRRORED"):
-        raise cfg.origins.error(path, f"{task} has no mirror images (table MIRRORED); set symmetry to false")
-    for name in [term for group in groups_in(cfg).values() for term in group.terms]:
-        kind, fault = cls.MIRRORED.get(name), ""
-        if name not in cls.MIRRORED:
-            fault = f" does not say how observation '{name}' is mirrored"
-        elif kind not in kinds:
-            fault = f": observation '{name}' has the unknown kind {kind!r}{suggest(str(kind), kinds, 'kinds')}"
-        if fault:
-            otherwise = f"set {path}=false to learn without mirror images"
-            raise cfg.origins.error(path, f"{task}.MIRRORED{fault}; {otherwise}")

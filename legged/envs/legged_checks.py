@@ -1,14 +1,17 @@
 """Checks of a legged robot's settings that are valid by themselves but may not fit each other or the robot."""
 
+from typing import Any, get_args
+
 from legged.config.checks import shown
 from legged.config.legged import LeggedConfig
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import draw_of
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
+from legged.errors import ConfigError, suggest
 from legged.mdp.actuator import check_actuator, check_motor_model, check_slowest
 from legged.mdp.control import acted_joints, action_scales, check_wheels, control_gains
-from legged.mdp.mirror_images import mirror_of_actions
+from legged.mdp.mirror_images import MirrorKind, mirror_of_actions
 from legged.physics.fields import FIELDS
 from legged.robots.robot import Robot
 from legged.terrain import check_terrain
@@ -19,14 +22,14 @@ MOST_VALUES = 10_000
 """Largest number of values of an axis of commands."""
 
 
-def check_legged(cfg: LeggedConfig, robot: Robot) -> None:
-    """Check a legged robot's settings, except those that `check_task` checks.
+def check_legged(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
+    """Check a legged robot's settings, except those that `check_task` checks. `cls` is the task's class.
 
     Raises:
         ConfigError: a setting does not fit the robot or another setting.
     """
     if cfg.train.algorithm.symmetry:
-        check_symmetry(cfg, robot)
+        check_symmetry(cls, cfg, robot)
     control_gains(robot, cfg.control, cfg.origins.where)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_wheels(robot, cfg.control, cfg.origins.where)
@@ -41,23 +44,25 @@ def check_legged(cfg: LeggedConfig, robot: Robot) -> None:
     check_grid(cfg)
 
 
-def check_symmetry(cfg: LeggedConfig, robot: Robot) -> None:
-    """Check that robot, default pose, actions, randomised properties and height scan have a mirror image.
+def check_symmetry(cls: Any, cfg: LeggedConfig, robot: Robot) -> None:
+    """Check that robot, default pose, actions, observations and height scan have a mirror image.
 
     Raises:
         ConfigError: one of them has no mirror image.
     """
     origins, path = cfg.origins, "train.algorithm.symmetry"
     otherwise = f"set {path}=false to learn without mirror images"
+
+    def fault(text: str) -> ConfigError:
+        return origins.error(path, f"{text}; {otherwise}")
+
     if robot.mirror is None:
-        text = f"left and right of '{robot.name}' are not symmetric (at zero joint angles); {otherwise}"
-        raise origins.error(path, text)
+        raise fault(f"left and right of '{robot.name}' are not symmetric (at zero joint angles)")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
     if uneven is not None:  # the observation `dof_pos` and the actions are relative to this pose, so it must be symmetric too
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
-        text = f"left and right default_joint_angles of '{robot.name}' are not symmetric ({angles}); {otherwise}"
-        raise origins.error(path, text)
+        raise fault(f"left and right default_joint_angles of '{robot.name}' are not symmetric ({angles})")
     acted = acted_joints(robot, cfg.control, origins.where)
     image = mirror_of_actions(robot.mirror, acted)
     if image is None:
@@ -71,6 +76,13 @@ def check_symmetry(cfg: LeggedConfig, robot: Robot) -> None:
                 text = f"left and right joints have different values ({pair}); {otherwise} ({origins.where(path)})"
                 raise origins.error(f"control.{field}", text)
     used = [term for group in groups_in(cfg).values() for term in group.terms]
+    kinds = get_args(MirrorKind)
+    for name in used:
+        if name not in cls.MIRRORED:
+            raise fault(f"{cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored")
+        if (kind := cls.MIRRORED[name]) not in kinds:
+            near = suggest(str(kind), kinds, "kinds")
+            raise fault(f"{cls.__name__}.MIRRORED: observation '{name}' has the unknown kind {kind!r}{near}")
     for name in FIELDS:
         if f"{PREFIX}{name}" in used:
             check_mirrored_draw(cfg, robot, name)

@@ -60,7 +60,7 @@ class RobotTask(RobotTerms, BaseTask):
         """
         super().check(cfg)
         assert isinstance(cfg, LeggedConfig)
-        check_legged(cfg, load_robot(cfg.robot, cfg.origins.where("robot")))
+        check_legged(cls, cfg, load_robot(cfg.robot, cfg.origins.where("robot")))
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
