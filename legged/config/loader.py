@@ -310,7 +310,7 @@ def from_dict(
 def override(cfg: TaskConfig, overrides: Iterable[tuple[str, Any]]) -> TaskConfig:
     """Return a copy of `cfg` with some settings replaced and checked. `overrides` are pairs of a dotted path and a value."""
     data = to_dict(cfg)
-    origins = Origins(cfg.origins)
+    origins = copy.copy(cfg.origins)
     _merge_overrides(data, overrides, origins, type(cfg))
     return from_dict(data, origins, source=cfg.task, schema=type(cfg))
 
