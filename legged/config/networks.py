@@ -70,7 +70,7 @@ def check_networks(cfg: TaskConfig) -> None:
         reserved = f"'{ESTIMATED}' is the group of the estimator's targets ({TARGETS}); rename your group"
         raise origins.error(f"observations.groups.{ESTIMATED}", reserved)
     if policy.rnn_type != "none" and algorithm.num_mini_batches > cfg.env.num_envs:
-        why = f"because a recurrent policy ({_told(cfg, 'train.policy.rnn_type')}) splits mini-batches by robot"
+        why = f"because {_recurrent(cfg)} splits mini-batches by robot"
         said = f"must be at most env.num_envs={cfg.env.num_envs}, {why}; got {algorithm.num_mini_batches}"
         raise origins.error("train.algorithm.num_mini_batches", said)
 
@@ -95,8 +95,8 @@ def _fixed_settings(cfg: TaskConfig) -> Iterator[tuple[str, Any, str]]:
         why = "without mirror images (train.algorithm.symmetry=true adds them)"
         yield "train.algorithm.mirror_loss_coeff", 0, why
     if policy.rnn_type != "none":
-        why = f"because a recurrent policy ({_told(cfg, 'train.policy.rnn_type')}) can't learn from mirror images"
-        yield "train.algorithm.symmetry", False, f"{why}; set train.algorithm.symmetry=false"
+        why = f"because {_recurrent(cfg)} can't learn from mirror images; set train.algorithm.symmetry=false"
+        yield "train.algorithm.symmetry", False, why
 
 
 def _text(value: Any) -> str:
@@ -108,3 +108,9 @@ def _told(cfg: TaskConfig, path: str) -> str:
     """Return path, value and source of a setting for errors."""
     value = attrgetter(path)(cfg)
     return f"{path}={f'{value:g}' if isinstance(value, float) else value} ({cfg.origins.of(path)})"
+
+
+def _recurrent(cfg: TaskConfig) -> str:
+    """Return a recurrent policy's description for errors."""
+    path = "train.policy.rnn_type"
+    return f"a recurrent policy ({path}={cfg.train.policy.rnn_type}, {cfg.origins.of(path)})"
