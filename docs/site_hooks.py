@@ -21,8 +21,8 @@ from mkdocs.structure.pages import Page
 
 from legged.cli.list import robots, tasks
 from legged.cli.main import COMMANDS, load
+from legged.config.legged import LeggedConfig
 from legged.config.reference import FieldText, fields
-from legged.config.schema import LeggedConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

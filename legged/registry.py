@@ -1,9 +1,7 @@
 """Registry of tasks: names, task classes and configurations. Every `cfg/*.yaml` is a task; users register their own."""
 
-import dataclasses
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -13,8 +11,7 @@ import torch
 
 from legged.config import TaskConfig, load_config
 from legged.config.checks import PLAIN, is_plain_name, shown
-from legged.config.loader import Registered, Rescale, class_hints
-from legged.config.networks import groups_in
+from legged.config.loader import Layer, Registered, Rescale, read_layers
 from legged.config.rescale import rescale
 from legged.envs import BaseTask, LeggedRobot, RobotTask
 from legged.envs.marks import unit_of
@@ -48,13 +45,7 @@ CLASSES = {
 """Name of a task class of this package, for `class:` in a task's YAML -> module of the class."""
 
 
-@dataclass(frozen=True)
-class _Entry(Registered):
-    task_class: type[BaseTask] | None
-    """Task class; None if the configuration determines the class, by `class:` or by the task that it extends."""
-
-
-_REGISTERED: dict[str, _Entry] = {}
+_REGISTERED: dict[str, Registered] = {}
 
 
 def register(name: str, config: Path | str | Mapping[str, Any], task_class: type[BaseTask] | None = None) -> None:
@@ -80,7 +71,7 @@ def register(name: str, config: Path | str | Mapping[str, Any], task_class: type
     if isinstance(config, str | Path):
         beside = folder / config
         config = (beside if exists(beside) else Path(config)).absolute()
-    _REGISTERED[name] = _Entry(config, folder, task_class)
+    _REGISTERED[name] = Registered(config, folder, task_class)
     add_ids([name])
 
 
@@ -115,7 +106,7 @@ def register_file(path: str, flag: str = "TASK") -> str:
     ours = data_folder("cfg") / f"{name}.yaml"
     other = known.config if known is not None else ours if ours.is_file() else None
     if other is None:
-        _REGISTERED[name] = _Entry(file, file.parent, None)
+        _REGISTERED[name] = Registered(file, file.parent)
         add_ids([name])
     elif not isinstance(other, Path) or other.resolve() != file.resolve():
         where = other if isinstance(other, Path) else "registered from code"
@@ -128,13 +119,19 @@ def task_names() -> list[str]:
     return sorted({path.stem for path in data_folder("cfg").glob("*.yaml")} | set(_REGISTERED))
 
 
-def _entry(name: str) -> _Entry:
-    if name in _REGISTERED:
-        return _REGISTERED[name]
-    path = data_folder("cfg") / f"{name}.yaml"
-    if not is_plain_name(name) or not path.is_file():
-        raise ConfigError(f"TASK: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
-    return _Entry(path, path.parent, None)
+def _layers_of(name: str) -> list[Layer]:
+    """Return the configuration of a task and those that it extends.
+
+    Raises:
+        ConfigError: the task does not exist, or a configuration can't be read.
+    """
+    entry = _REGISTERED.get(name)
+    if entry is None:
+        path = data_folder("cfg") / f"{name}.yaml"
+        if not is_plain_name(name) or not path.is_file():
+            raise ConfigError(f"TASK: there is no task {shown(name)}{suggest(name[:100], task_names(), 'tasks')}")
+        entry = Registered(path, path.parent)
+    return read_layers(entry, name, _REGISTERED)
 
 
 def task_class(name: str) -> type[BaseTask]:
@@ -143,13 +140,17 @@ def task_class(name: str) -> type[BaseTask]:
     Raises:
         ConfigError: the task does not exist, or its configuration names a class that does not exist.
     """
-    for hint in class_hints(_entry(name), name, _REGISTERED):
-        entry = _REGISTERED.get(hint.task or "")
-        if entry is not None and entry.task_class is not None:
-            return entry.task_class
-        if hint.kind is not None:
-            return _class_named(hint.kind, hint.where)
-    return LeggedRobot
+    return _class_of(_layers_of(name))
+
+
+def _class_of(layers: Iterable[Layer]) -> type[BaseTask]:
+    """Return the class that the first of `layers` with a class names, or else LeggedRobot."""
+    layer = next((layer for layer in layers if layer.task_class is not None), None)
+    if layer is None:
+        return LeggedRobot
+    kind = layer.task_class
+    is_class = isinstance(kind, type) and issubclass(kind, BaseTask)
+    return kind if is_class else _class_named(kind, f"{layer.name}: class")
 
 
 def _class_named(kind: Any, where: str) -> type[BaseTask]:
@@ -195,41 +196,12 @@ def task_config(name: str, overrides: Iterable[tuple[str, Any]] = (), on_cpu: bo
     Raises:
         ConfigError: there is no such task, or its configuration is invalid.
     """
-    kind = task_class(name)
+    layers = _layers_of(name)
+    kind = _class_of(layers)
     schema = _schema_of(kind)
-    cfg = load_config(_entry(name), name, overrides, on_cpu, _REGISTERED, schema, _rescaler(kind, schema))
+    cfg = load_config(layers, name, overrides, on_cpu, schema, _rescaler(kind, schema))
     kind.check(cfg)
-    _check_units(kind, cfg)
     return cfg
-
-
-def _check_units(kind: type[BaseTask], cfg: TaskConfig) -> None:
-    """Check that every term whose number was rescaled from another robot declares its unit.
-
-    Raises:
-        ConfigError: a term in use has a rescaled number other than 0, but declares no unit.
-    """
-    running = {
-        "_reward_": set(cfg.rewards.scales),
-        "_obs_": {name for group in groups_in(cfg).values() for name in group.terms},
-    }
-    for section in ("rewards", "observations"):
-        for field in dataclasses.fields(getattr(cfg, section)):
-            prefix, _ = field.metadata.get("unit_of", ("", 1))
-            for name, number in getattr(getattr(cfg, section), field.name).items() if prefix in running else ():
-                path = f"{section}.{field.name}.{name}"
-                if not number or name not in running[prefix] or cfg.origins.of(path) not in cfg.origins.rescaled:
-                    continue
-                if unit_of(getattr(kind, prefix + name)) is None:
-                    parents = (unit_of(getattr(part, prefix + name, None)) for part in kind.__mro__)
-                    example = next((unit for unit in parents if unit is not None), "m^2/s^2")
-                    raise ConfigError(
-                        f"{cfg.origins.where(path)}: the number is rescaled from another robot, but"
-                        f" {kind.__name__}.{prefix}{name}"
-                        f' declares no unit. Write @unit("{example}") above the method, with the unit of its return value'
-                        ' (from legged import unit). For a value without a unit, write @unit("1"). A unit in the docstring is'
-                        " not read"
-                    )
 
 
 def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
@@ -241,7 +213,7 @@ def _rescaler(kind: type[BaseTask], schema: type[TaskConfig]) -> Rescale:
             return TERRAIN_TYPES[entry].unit if entry in TERRAIN_TYPES else "1"
         if section == "domain_rand.ranges":
             return FIELDS[entry].unit.partition(" or ")[0] if entry in FIELDS else "1"
-        return unit_of(getattr(kind, name, None)) or "1"  # `_check_units` refuses terms without a unit
+        return unit_of(getattr(kind, name, None)) or "1"  # `check_terms` refuses terms without a unit
 
     def rescale_layer(data: Mapping[str, Any], reference_robot: str, robot: str, where: str) -> Mapping[str, Any]:
         if not issubclass(kind, RobotTask):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics import Physics, RobotState, Scene
 from legged.physics import make_physics as build_physics
 

@@ -9,7 +9,8 @@ import torch
 from devices import engine_of
 from torch import Tensor
 
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import SimConfig
 from legged.math import quat_rotate
 from legged.physics import Physics, RobotState
 from legged.physics.scene import RobotScene

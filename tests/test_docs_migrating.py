@@ -15,8 +15,8 @@ from legged import math as legged_math
 from legged import registry, user_modules
 from legged.cli.migrate import _task_name
 from legged.cli.train import train
+from legged.config.legged import LeggedConfig
 from legged.config.loader import to_dict
-from legged.config.schema import LeggedConfig
 from legged.envs import LeggedRobot
 from legged.envs.legged_gym_names import COMPUTED, CONSTANT, KEPT, PLAIN, SUBSTEPS
 from legged.math import quat_rotate, yaw_of

@@ -18,8 +18,8 @@ import yaml
 
 from legged.cli.list import robots, tasks
 from legged.cli.main import COMMANDS, load
+from legged.config.legged import LeggedConfig
 from legged.config.reference import fields
-from legged.config.schema import LeggedConfig
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import torch
-from legged.process.command_parser import CommandParser
 
 from legged.commandline.command import run_main
+from legged.deploy.command_parser import CommandParser
 from legged.episodes.recorder import Wish, roll_out
 from legged.math import quat_conjugate, quat_multiply, rotation_vector
 from legged.motion.checks import quality_of

@@ -14,7 +14,8 @@ import torch
 from legged.commandline.arguments import IMPORT, POLICY_HELP, import_given
 from legged.commandline.command import EXIT_WRONG_INPUT, sub_command
 from legged.config import follows_velocities, has_robot, parse_override
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import SimConfig
 from legged.deploy.__main__ import PROGRAM, limits_of
 from legged.deploy.command_parser import argument, check_between
 from legged.deploy.contract import SCANS, Contract, read_contract

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 
 from legged.commandline.command import sub_command
+from legged.deploy.command_parser import argument, check_number
 from legged.errors import ConfigError
 from legged.figures import figure
 from legged.motion.checks import SOFT, Quality, quality_of
@@ -14,7 +15,6 @@ from legged.motion.clip import Clip, write_clip
 from legged.motion.kinematics import Skeleton
 from legged.motion.readers import CSV_FPS, read_clip
 from legged.play.films import write_mp4
-from legged.process.command_parser import argument, check_number
 from legged.process.paths import ready_to_write, relative
 from legged.rendering.clip_pictures import pictures_of
 from legged.robots.robot import load_robot

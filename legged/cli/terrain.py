@@ -47,7 +47,6 @@ def terrain(args: argparse.Namespace) -> int:
                 f"{args.task}: has no terrain to show, because its ground is a plane (terrain.mesh_type); name"
                 " types to show with --types"
             )
-        check_terrain(cfg.terrain, cfg.origins)
         grid = Terrain.build(cfg.terrain, cfg.env.seed)
         types: Sequence[str] = grid.type_names
         levels = [f"{row / cfg.terrain.num_rows:g}" if cfg.terrain.curriculum else "" for row in range(cfg.terrain.num_rows)]

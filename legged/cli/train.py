@@ -25,12 +25,13 @@ from legged.commandline.arguments import (
 )
 from legged.commandline.command import EXIT_FAILED, quiet_writers, stopping_on_signals, sub_command, when_output_is_lost
 from legged.commandline.show import summary
-from legged.config import TaskConfig, follows_velocities, to_yaml
+from legged.config import TaskConfig, to_yaml
 from legged.config.networks import learns_from_teacher
 from legged.deploy.command_parser import argument
 from legged.envs import BaseTask
+from legged.envs.checks import check_rewards
 from legged.errors import ConfigError, RunError
-from legged.evaluation.during_training import TrainingEvaluation, few_commands
+from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.captured import CapturedRunner
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.display import Display
@@ -101,10 +102,8 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
         cfg = task_config(args.task, overrides(args), on_cpu)
     teacher = teacher_of(cfg, checkpoint, args)
     resolve_physics(cfg.sim.physics, device, cfg.origins.where("sim.physics"))
-    if cfg.train.runner.evaluate_interval and follows_velocities(cfg):
-        few_commands(cfg)  # raises an error if evaluations would have no grid of commands
     check_tracker(cfg)
-    _check_rewards(cfg)
+    check_rewards(task_class(cfg.task), cfg)
     if args.show:
         print(to_yaml(cfg), end="")
         print(*summary(cfg), sep="\n")
@@ -155,18 +154,6 @@ def train(args: argparse.Namespace, prepared: Callable[[Runner], None] | None = 
         return 0
     # Even without a signal to this process, a training stops if its output is lost or if another process gets a signal.
     return 128 + stopped_by[0] if stopped_by else EXIT_FAILED if first else 128 + signal.SIGTERM
-
-
-def _check_rewards(cfg: TaskConfig) -> None:
-    """Check that a task that learns from rewards has a reward, unless its class overrides `compute_reward`.
-
-    Raises:
-        ConfigError: all scales are 0, or `rewards.scales` is empty.
-    """
-    own = task_class(cfg.task).compute_reward is not BaseTask.compute_reward
-    if not (own or learns_from_teacher(cfg) or any(cfg.rewards.scales.values())):
-        known = ", ".join(sorted(task_class(cfg.task).terms("_reward_")))
-        raise ConfigError(f"{cfg.task}: rewards.scales: no reward has a scale other than 0 (rewards: {known})")
 
 
 def _runner(task: BaseTask, teacher: Teacher | None, rl_device: torch.device, display: Display | None) -> Runner:

@@ -9,7 +9,8 @@ import torch
 
 from legged.config import TaskConfig, override
 from legged.config.networks import groups_in
-from legged.config.schema import DrawConfig, RobotDomainRandConfig
+from legged.config.randomization import DrawConfig
+from legged.config.robot import RobotDomainRandConfig
 from legged.envs import BaseTask, is_robot_task
 from legged.mdp.control import action_scales
 from legged.mdp.distributions import standard_deviation

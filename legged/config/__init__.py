@@ -1,4 +1,8 @@
-"""Typed configuration. `schema` defines the settings, `loader` reads them.
+"""Typed configuration: dataclasses define every setting of a task file, with meaning, unit, default and bounds.
+
+A file under `cfg/` states only the differences from the defaults. The sections of every task are in task.py, world.py, mdp.py
+and learning.py. Those of a task with a robot are in robot.py, and those of velocity commands in legged.py. `loader` reads and
+checks files.
 
 Code that treats some tasks differently asks for one of these capabilities, and not for a class:
 
@@ -11,10 +15,10 @@ Code that treats some tasks differently asks for one of these capabilities, and 
 | switches that a measurement sets to false | `DISTURBANCES` | |
 """
 
-from legged.config.legged import follows_velocities
+from legged.config.legged import LeggedConfig, follows_velocities
 from legged.config.loader import from_dict, load_config, override, parse_override, to_dict, to_yaml
-from legged.config.robot import has_robot
-from legged.config.schema import LeggedConfig, RobotConfig, TaskConfig
+from legged.config.robot import RobotConfig, has_robot
+from legged.config.task import TaskConfig
 
 __all__ = [
     "LeggedConfig",

@@ -29,9 +29,9 @@ def positive(high: float, low: float = SMALLEST) -> Bounds:
     return {"above": 0, "min": low, "max": high}
 
 
-def items(most: int, bounds: Bounds | None = None) -> Bounds:
+def items(most: int, bounds: Bounds) -> Bounds:
     """Return metadata of a list of 1 to `most` items, each within `bounds`."""
-    return {"items": most, **(bounds or {})}
+    return {"items": most, **bounds}
 
 
 def quantity(unit: str, bounds: Bounds) -> Bounds:
@@ -44,23 +44,18 @@ def rescaled(unit: str, bounds: Bounds) -> Bounds:
     return {**quantity(unit, bounds), "rescaled": unit}
 
 
-def rescaled_by_term(prefix: str, power: int, bounds: Bounds) -> Bounds:
-    """Return metadata of a map: term -> number. The numbers are rescaled for another robot. The unit of a number is the unit
-    that the method `<prefix><term>` declares, raised to `power`.
+def rescaled_by_entry(prefix: str, bounds: Bounds, power: int = 1) -> Bounds:
+    """Return metadata of a map: name -> number. The numbers are rescaled for another robot. Each number has its own unit: the
+    unit of `<prefix><name>`, raised to `power`. This is a method that declares the unit, such as "_reward_torques", or the
+    dotted path of an entry, such as "terrain.sizes.step".
     """
     return {**bounds, "unit_of": (prefix, power)}
-
-
-def rescaled_by_entry(path: str, bounds: Bounds) -> Bounds:
-    """Return metadata of the map at the dotted `path`. Each entry has its own unit, and is rescaled for another robot."""
-    return {**bounds, "unit_of": (f"{path}.", 1)}
 
 
 UNIT = between(0, 1)
 NAME: Bounds = {"name": True}
 """Metadata of a text that is the name of a folder. The text may be empty."""
-NAMES = items(1000)
+NAMES = items(1000, {"unique": True})
 """Metadata of a list of texts without duplicates. The list must not be empty."""
-NAMES["unique"] = True
 TERMS: Bounds = {**NAMES, "may_be_empty": True}
 """Metadata of a list of texts without duplicates. The list may be empty."""

@@ -4,11 +4,12 @@ the source of the value, such as a file.
 
 import dataclasses
 import functools
-import math
+import operator
+import sys
 import types
 import typing
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal, TypeVar, Union
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, Literal, NamedTuple, TypeVar, Union
 
 from legged.config.bounds import FLOAT32_MAX
 from legged.config.origins import Origins
@@ -22,6 +23,7 @@ DEEPEST = 30
 """Deepest allowed nesting of maps and lists in a configuration."""
 SHOWN = 80
 """Longest text of a value in an error, in characters."""
+FINITE = f"from -{FLOAT32_MAX:g} to {FLOAT32_MAX:g}"
 PLAIN = "a plain name: no path separators, not '..', no leading '.', no control characters, at most 100 letters"
 
 
@@ -53,154 +55,158 @@ def is_plain_name(name: str) -> bool:
     return not any(mark in name for mark in "/\\") and len(name) <= LONGEST_NAME and len(name.encode()) <= 2 * LONGEST_NAME
 
 
-def build(schema: type[T], data: Any, path: str, origins: Origins, source: str, base: T | None = None) -> T:
+class _Place(NamedTuple):
+    """Place of a value in a configuration, for errors."""
+
+    path: str
+    """Dotted path of the value; empty for the whole configuration."""
+    origins: Origins
+    """Sources of the settings. If it is empty, all values are from `source`."""
+    source: str
+
+    def at(self, key: Any) -> "_Place":
+        """Return the place of the value of `key` in a map."""
+        return self._replace(path=f"{self.path}.{plain_path(key)}" if self.path else plain_path(key))
+
+    def error(self, text: str) -> ConfigError:
+        origin = self.origins.of(self.path) if self.path and self.origins else self.source
+        return ConfigError(f"{origin}: {self.path or 'top level'}: {text}")
+
+    def expected(self, what: str, value: Any) -> ConfigError:
+        return self.error(f"expected {what}, got {shown(value)}")
+
+
+def build(
+    schema: type[T],
+    data: Any,
+    source: str,
+    origins: Origins | None = None,
+    others: Collection[str] = (),
+    path: str = "",
+) -> T:
     """Build an instance of the dataclass `schema` from the mapping `data`, and check every field. A field that is missing in
-    `data` gets the value that it has in `base`. If `base` is None, the field gets its default.
+    `data` gets its default.
+
+    Args:
+        schema: a dataclass, whose fields have bounds as metadata (bounds.py).
+        data: nested plain values, such as those of a YAML file.
+        source: source of the values, such as a file.
+        origins: sources of single values. If it is empty or None, all values are from `source`.
+        others: keys that an error about an unknown key lists too, in addition to the names of the fields.
+        path: dotted path of `data` in its configuration; empty for a whole configuration.
 
     Raises:
         ConfigError: an unknown key, a wrong type, or a value beyond its bounds.
     """
-    where = f"{_origin(path, origins, source)}: {path or 'top level'}"
+    return _section(schema, data, _Place(path, origins or Origins(), source), others=others)
+
+
+def _section(schema: type[T], data: Any, place: _Place, base: T | None = None, others: Collection[str] = ()) -> T:
+    """Build an instance of `schema`. A field that is missing in `data` gets the value that it has in `base`. If `base` is
+    None, the field gets its default.
+    """
     if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: expected a mapping with keys of {schema.__name__}, got {shown(data)}")
+        raise place.expected(f"a mapping with keys of {schema.__name__}", data)
     fields = {f.name: f for f in dataclasses.fields(schema) if f.compare}  # type: ignore[arg-type]
     hints = hints_of(schema)  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for key, value in data.items():
-        shown_key = plain_path(key)
-        dotted = f"{path}.{shown_key}" if path else shown_key
         if key not in fields:
-            known = suggest(shown_key, fields)
-            raise ConfigError(f"{_origin(dotted, origins, source)}: {dotted}: unknown key {shown(key)}{known}")
-        if dataclasses.is_dataclass(hints[key]):
-            values[key] = build(hints[key], value, dotted, origins, source)  # type: ignore[arg-type]
-            continue
-        is_map = typing.get_origin(hints[key]) is dict
+            known = suggest(plain_path(key), [*fields, *others])
+            raise place.at(key).error(f"unknown key {shown(key)}{known}")
         factory = fields[key].default_factory
-        entries = factory() if is_map and callable(factory) else {}
-        if is_map and dataclasses.is_dataclass(typing.get_args(hints[key])[1]):
-            checked = _build_entries(typing.get_args(hints[key])[1], value, dotted, origins, source, entries)
-        else:
-            checked = _check(hints[key], value, dotted, origins, source)
-        if fields[key].metadata:
-            _check_bounds(checked, fields[key].metadata, dotted, f"{_origin(dotted, origins, source)}: ")
-        values[key] = {**entries, **checked} if is_map else checked  # maps are merged with the schema's default entries
+        # Maps are merged with the schema's default entries.
+        entries = factory() if typing.get_origin(hints[key]) is dict and callable(factory) else None
+        values[key] = _check(hints[key], value, place.at(key), fields[key].metadata, entries)
     return schema(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
 
 
-def _build_entries(
-    schema: Any, data: Any, path: str, origins: Origins, source: str, entries: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Build each section of the map `data`. A field that a section lacks gets its value from the section with the same name
-    in `entries`, or its default if `entries` has no such section.
-    """
-    names = _check(dict[str, object], data, path, origins, source)  # only keys are checked here; `build` checks the values
-    return {
-        name: build(schema, data[name], f"{path}.{plain_path(name)}", origins, source, entries.get(name)) for name in names
-    }
-
-
-def _origin(path: str, origins: Origins, source: str) -> str:
-    """Return the source that `origins` records for `path`. If `origins` or `path` is empty, return `source`."""
-    return origins.of(path) if path and origins else source
-
-
-WORDS = {
-    float: "a number",
-    Literal: "a name",
-    tuple: "[low, high]",
-    dict: "a mapping from names to numbers",
-    Mapping: "a mapping with the key range",
+WORDS: dict[Any, tuple[Any, str]] = {
+    float: ((int, float), "a number"),
+    Literal: (str, "a name"),
+    tuple: ((list, tuple), "[low, high]"),
+    dict: (Mapping, "a mapping from names to numbers"),
+    Mapping: (Mapping, "a mapping with the key range"),
 }
-"""Kind of value -> its description in an error."""
+"""Kind of an alternative in a union -> types of its values, and its description in an error. A section has the kind
+Mapping."""
+SCALARS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+"""Type of a single value -> its description in an error."""
 
 
-def _shape(kind: Any) -> Any:
+def _kind_in_union(kind: Any) -> Any:
     """Return the key of WORDS that describes the values of a type."""
     origin = typing.get_origin(kind)
-    return Mapping if dataclasses.is_dataclass(kind) else origin if origin in (Literal, tuple, dict) else float
+    return Mapping if dataclasses.is_dataclass(kind) else origin if origin in WORDS else float
 
 
-def _has_shape(kind: Any, value: Any) -> bool:
-    looks_like: dict[Any, Any] = {float: (int, float), Literal: str, tuple: (list, tuple), dict: Mapping, Mapping: Mapping}
-    return isinstance(value, looks_like[_shape(kind)])
-
-
-def _check(kind: Any, value: Any, path: str, origins: Origins, source: str) -> Any:
+def _check(kind: Any, value: Any, place: _Place, bounds: Mapping[str, Any], default: Any = None) -> Any:
     """Return `value` as the type `kind`, or raise ConfigError. Integers become floats where `kind` is float, lists become
-    tuples, and nothing else is converted.
+    tuples, and nothing else is converted. All numbers and texts in the value are checked against `bounds`. A section or a map
+    is completed with the fields or entries of `default`.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
-
-    def fail(expected: str) -> ConfigError:
-        return ConfigError(f"{_origin(path, origins, source)}: {path}: expected {expected}, got {shown(value)}")
-
     if kind is Any:
-        return _check_free(value, fail)
+        return _check_free(value, functools.partial(place.expected, value=value))
+    if dataclasses.is_dataclass(kind):
+        return _section(typing.cast(type, kind), value, place, default)
     if origin is Literal:
         if not isinstance(value, str) or value not in args:
             known = suggest(value if isinstance(value, str) else shown(value), args)
-            raise ConfigError(f"{_origin(path, origins, source)}: {path}: unknown value {shown(value)}{known}")
+            raise place.error(f"unknown value {shown(value)}{known}")
         return value
     if origin in (Union, types.UnionType):
         if value is None and type(None) in args:
             return None
         kinds = [a for a in args if a is not type(None)]
-        fitting = [a for a in kinds if _has_shape(a, value)] if len(kinds) > 1 else kinds
+        fitting = [a for a in kinds if isinstance(value, WORDS[_kind_in_union(a)][0])] if len(kinds) > 1 else kinds
         if not fitting:
-            raise fail(", or ".join(WORDS[_shape(a)] for a in sorted(kinds, key=lambda a: list(WORDS).index(_shape(a)))))
-        if dataclasses.is_dataclass(fitting[0]):
-            return build(fitting[0], value, path, origins, source)  # type: ignore[arg-type]
-        return _check(fitting[0], value, path, origins, source)
+            named = {_kind_in_union(a) for a in kinds}
+            raise place.expected(", or ".join(words for one, (_, words) in WORDS.items() if one in named), value)
+        return _check(fitting[0], value, place, bounds)
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise fail("a list")
-        if len(args) == 2 and args[1] is Ellipsis:
-            return tuple(_check(args[0], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
-        if len(value) != len(args):
-            raise fail(f"a list of {len(args)} numbers")
-        checked = tuple(_check(args[i], v, f"{path}[{i}]", origins, source) for i, v in enumerate(value))
-        if args in ((float, float), (int, int)) and checked[0] > checked[1]:
-            raise fail("[low, high] with low <= high")
-        return checked
+        return _check_list(args, value, place, bounds)
     if origin is dict:
         if not isinstance(value, Mapping):
-            raise fail("a mapping")
+            raise place.expected("a mapping", value)
         for key in value:
             if not isinstance(key, str):
-                raise fail(f"a mapping whose keys are text (one key is {shown(key)})")
-        return {k: _check(args[1], v, f"{path}.{plain_path(k)}", origins, source) for k, v in value.items()}
-    if kind is bool:
-        if not isinstance(value, bool):
-            raise fail("true or false")
-    elif kind is int:
-        if not isinstance(value, int) or isinstance(value, bool):
-            raise fail("a whole number")
-    elif kind is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise fail("a number")
-        return _number(value, fail)
-    elif kind is str:
-        if not isinstance(value, str):
-            raise fail("text")
-        return str.__str__(value)
+                raise place.expected(f"a mapping whose keys are text (one key is {shown(key)})", value)
+        default = default or {}
+        return {**default, **{k: _check(args[1], v, place.at(k), bounds, default.get(k)) for k, v in value.items()}}
+    if kind not in SCALARS:
+        return value
+    if not isinstance(value, (int, float) if kind is float else kind) or (isinstance(value, bool) and kind is not bool):
+        raise place.expected(SCALARS[kind], value)
+    if kind is float and not abs(value) <= sys.float_info.max:  # also refuses NaN
+        raise place.expected("a number" if value != value else f"a finite number, {FINITE}", value)
+    value = float(value) if kind is float else str.__str__(value) if kind is str else value
+    _check_bounds(value, bounds, place)
     return value
 
 
-def _number(value: float, fail: Any) -> float:
-    """Return a number as a finite float."""
-    if value != value:
-        raise fail("a number")
-    try:
-        number = float(value)
-    except OverflowError:
-        number = math.inf
-    if math.isinf(number):
-        raise fail(f"a finite number, from -{FLOAT32_MAX:g} to {FLOAT32_MAX:g}")
-    return number  # `build` checks the field's bounds later
+def _check_list(kinds: tuple[Any, ...], value: Any, place: _Place, bounds: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return a list as a tuple whose items have the types `kinds`. The types (kind, ...) allow any number of items."""
+    if not isinstance(value, list | tuple):
+        raise place.expected("a list", value)
+    each = kinds[:1] * len(value) if kinds[1:] == (Ellipsis,) else kinds
+    if len(value) != len(each):
+        raise place.expected(f"a list of {len(each)} numbers", value)
+    items = [place._replace(path=f"{place.path}[{i}]") for i in range(len(value))]
+    checked = tuple(_check(*one, bounds) for one in zip(each, value, items, strict=True))
+    if kinds in ((float, float), (int, int)) and checked[0] > checked[1]:
+        raise place.expected("[low, high] with low <= high", value)
+    if bounds and not checked and "may_be_empty" not in bounds:
+        raise place.error("must not be empty")
+    if len(checked) > bounds.get("items", len(checked)):
+        raise place.error(f"must have at most {bounds['items']} items, got {len(checked)}")
+    twice = next((item for i, item in enumerate(checked) if item in checked[:i]), None) if bounds.get("unique") else None
+    if twice is not None:
+        raise place.error(f"{shown(twice)} is named twice")
+    return checked
 
 
-def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
+def _check_free(value: Any, fail: Callable[[str], ConfigError], depth: int = 0) -> Any:
     """Return a copy of a value whose field has the type `Any`, e.g. in the section `custom`. The value may be anything that
     YAML can write and read, except NaN and infinite numbers.
     """
@@ -213,47 +219,25 @@ def _check_free(value: Any, fail: Any, depth: int = 0) -> Any:
         return {key: _check_free(item, fail, depth + 1) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_check_free(item, fail, depth + 1) for item in value]
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        if value != value or not abs(value) <= FLOAT32_MAX:
-            raise fail(f"finite numbers, from -{FLOAT32_MAX:g} to {FLOAT32_MAX:g}")
-        return int(value) if isinstance(value, int) else float(value)  # YAML can't write NumPy numbers
-    elif value is not None and not isinstance(value, bool | str):
+    if value is None or isinstance(value, bool | str):
+        return value
+    if not isinstance(value, int | float):
         raise fail("a number, a text, true, false, null, or a list or map of these")
-    return value
+    if not abs(value) <= FLOAT32_MAX:
+        raise fail(f"finite numbers, {FINITE}")
+    return int(value) if isinstance(value, int) else float(value)  # YAML can't write NumPy numbers
 
 
-def _check_bounds(value: Any, bounds: Mapping[str, Any], path: str, origin: str) -> None:
-    """Check a value, and all items in it, against the bounds of its field."""
-    if dataclasses.is_dataclass(value):
-        return  # a section's fields have their own bounds
-    if isinstance(value, tuple):
-        _check_length(value, bounds, f"{origin}{path}")
-        for i, item in enumerate(value):
-            _check_bounds(item, bounds, f"{path}[{i}]", origin)
-        return
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            _check_bounds(item, bounds, f"{path}.{plain_path(key)}", origin)
-        return
-    where = f"{origin}{path}"
+LIMITS = {"above": (operator.le, "above"), "min": (operator.lt, "at least"), "max": (operator.gt, "at most")}
+"""Key of a bound -> test whether a number is beyond the bound, and its word in an error."""
+
+
+def _check_bounds(value: Any, bounds: Mapping[str, Any], place: _Place) -> None:
+    """Check a number or a text against the bounds of its field."""
     if isinstance(value, str):
         if "name" in bounds and value and not is_plain_name(value):
-            raise ConfigError(f"{where}: expected {PLAIN}; got {shown(value)}")
+            raise place.error(f"expected {PLAIN}; got {shown(value)}")
         return
-    if "above" in bounds and value <= bounds["above"]:
-        raise ConfigError(f"{where}: must be above {bounds['above']}, got {shown(value)}")
-    if "min" in bounds and value < bounds["min"]:
-        raise ConfigError(f"{where}: must be at least {bounds['min']}, got {shown(value)}")
-    if "max" in bounds and value > bounds["max"]:
-        raise ConfigError(f"{where}: must be at most {bounds['max']}, got {shown(value)}")
-
-
-def _check_length(value: Sequence[Any], bounds: Mapping[str, Any], where: str) -> None:
-    if not value and not bounds.get("may_be_empty"):
-        raise ConfigError(f"{where}: must not be empty")
-    if len(value) > bounds.get("items", len(value)):
-        raise ConfigError(f"{where}: must have at most {bounds['items']} items, got {len(value)}")
-    if bounds.get("unique"):
-        twice = next((item for i, item in enumerate(value) if item in value[:i]), None)
-        if twice is not None:
-            raise ConfigError(f"{where}: {shown(twice)} is named twice")
+    for key, (is_beyond, word) in LIMITS.items():
+        if key in bounds and is_beyond(value, bounds[key]):
+            raise place.error(f"must be {word} {bounds[key]}, got {shown(value)}")

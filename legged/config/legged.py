@@ -6,7 +6,7 @@ Fields that also exist in legged_gym (v1.0.2, arXiv 2109.11978) have the same de
 from dataclasses import dataclass, field
 from typing import TypeGuard
 
-from legged.config.bounds import LARGEST, LONGEST_S, UNIT, between, positive, quantity, rescaled, rescaled_by_term
+from legged.config.bounds import LARGEST, LONGEST_S, UNIT, between, positive, quantity, rescaled, rescaled_by_entry
 from legged.config.mdp import ObservationGroupConfig, Range
 from legged.config.robot import MOTION, RobotConfig, RobotObservationsConfig, RobotRewardsConfig
 from legged.config.section import Section
@@ -86,7 +86,7 @@ class LeggedRewardsConfig(RobotRewardsConfig):
             "collision": -1.0,
             "action_rate": -0.01,
         },
-        metadata=rescaled_by_term("_reward_", -1, between(-LARGEST, LARGEST)),
+        metadata=rescaled_by_entry("_reward_", between(-LARGEST, LARGEST), -1),
     )
     """Term -> scale, which is multiplied by the control step. A scale of 0 switches the term off."""
     only_positive_rewards: bool = True

@@ -29,6 +29,8 @@ class Registered:
     config: Path | Mapping[str, Any]
     folder: Path
     """Folder of the user-defined code. Paths in a mapping are relative to this folder."""
+    task_class: type | None = None
+    """Class of the task; None if the configuration determines the class, by `class:` or by the task that it extends."""
 
 
 Schema = TypeVar("Schema", bound=TaskConfig)
@@ -40,13 +42,8 @@ task's robot."""
 
 def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Origins, prefix: str = "") -> None:
     """Merge `top` into `base` in place. Maps are merged key by key. A list or a scalar replaces the value in `base`. Record
-    `source` in `origins` as the source of each path.
-
-    Raises:
-        ConfigError: the maps are nested too deeply.
+    `source` in `origins` as the source of each path. `top` has been checked, so that its nesting is limited.
     """
-    if prefix.count(".") > DEEPEST:
-        raise ConfigError(f"{source}: {shown(prefix)}: more than {DEEPEST} nested sections")
     for key, value in top.items():
         path = f"{prefix}{plain_path(key)}"
         if isinstance(value, Mapping):
@@ -60,7 +57,7 @@ def merge(base: dict[str, Any], top: Mapping[str, Any], source: str, origins: Or
 
 
 @dataclass(frozen=True)
-class _Layer:
+class Layer:
     """One configuration in a chain of `extends`."""
 
     data: Mapping[str, Any]
@@ -69,27 +66,28 @@ class _Layer:
     """Name of the configuration in error messages."""
     folder: Path
     """Folder to which the paths in the settings are relative."""
-    task: str | None
-    """Name of the registered task; None for a file."""
-    kind: Any
-    """Value of the key `class`; None without this key."""
+    task_class: Any
+    """Class with which the task was registered, or else the value of the key `class`; None without both."""
     reference_robot: Any
     """Robot for which the numbers were written; None if they suit any robot."""
     own_rewards: bool
     """True if the reward scales of the extended configurations, and the schema's defaults, do not count."""
 
 
-def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> list[_Layer]:
-    """Return the configuration of `task` and the chain of configurations that it extends.
+def read_layers(source: Source, task: str, registered: Mapping[str, Registered] | None = None) -> list[Layer]:
+    """Return the configuration `source` of `task` and the chain of configurations that it extends, which are files or tasks
+    in `registered`.
 
     Raises:
         ConfigError: a configuration is missing, can't be read, or extends itself.
     """
-    layers: list[_Layer] = []
+    layers: list[Layer] = []
     seen: list[Any] = []
-    found, name = source, name_of(source, task)
+    found = source if isinstance(source, Registered) else Registered(source, Path.cwd())
     while True:
-        given = found.config if isinstance(found, Registered) else found
+        given = found.config
+        is_file = isinstance(given, Path)
+        name = str(given) if is_file else f"registered config of '{task}'"
         if _mark(found) in seen:
             chain = " -> ".join(Path(n).name for n in (*(layer.name for layer in layers), name))
             raise ConfigError(f"{name}: extends itself: {chain}")
@@ -108,62 +106,39 @@ def _layers(source: Source, task: str, registered: Mapping[str, Registered]) -> 
         own_rewards = data.pop("own_rewards", False)
         if not isinstance(own_rewards, bool):
             raise ConfigError(f"{name}: own_rewards: expected true or false, got {shown(own_rewards)}")
-        beside = given.parent if isinstance(given, Path) else None
-        folder = beside or (found.folder if isinstance(found, Registered) else Path.cwd())
-        registered_as = task if isinstance(found, Registered) else None
-        layers.append(_Layer(data, name, folder, registered_as, kind, reference_robot, own_rewards))
+        folder = given.parent if isinstance(given, Path) else found.folder
+        layers.append(Layer(data, name, folder, found.task_class or kind, reference_robot, own_rewards))
         if parent is None:
             return layers
-        others = {key: entry for key, entry in registered.items() if _mark(entry) not in seen}
-        found, task = _parent(parent, name, beside, others)
-        name = name_of(found, task)
+        others = {key: entry for key, entry in (registered or {}).items() if _mark(entry) not in seen}
+        found, task = _parent(parent, name, folder if is_file else None, others), parent
 
 
-def _mark(source: Source) -> Any:
+def _mark(source: Registered) -> Any:
     """Return an identifier of a configuration."""
-    given = source.config if isinstance(source, Registered) else source
-    return given.resolve() if isinstance(given, Path) else id(given)
+    return source.config.resolve() if isinstance(source.config, Path) else id(source.config)
 
 
-def _parent(
-    parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]
-) -> tuple[Path | Registered, str]:
-    """Find the configuration `parent`, which the configuration `name` extends. Return it and its name. The search covers
-    the files in the folder `beside`, then the registered tasks, then the tasks of this package.
+def _parent(parent: Any, name: str, beside: Path | None, registered: Mapping[str, Registered]) -> Registered:
+    """Find the configuration `parent`, which the configuration `name` extends. The search covers the files in the folder
+    `beside`, then the registered tasks, then the tasks of this package.
     """
     if not isinstance(parent, str) or not parent:
         raise ConfigError(f"{name}: extends: expected the name of a task or a file in the same folder, got {shown(parent)}")
     file = parent if parent.endswith((".yaml", ".yml")) else f"{parent}.yaml"
-    if beside is not None and exists(beside / file):
-        return beside / file, parent
-    if parent in registered:
-        return registered[parent], parent
-    if exists(data_folder("cfg") / file):
-        return data_folder("cfg") / file, parent
     folders = [data_folder("cfg"), *([] if beside is None else [beside])]
+    if beside is not None and exists(beside / file):
+        return Registered(beside / file, beside)
+    if parent in registered:
+        return registered[parent]
+    if exists(data_folder("cfg") / file):
+        return Registered(data_folder("cfg") / file, data_folder("cfg"))
     names = {path.stem for folder in folders for path in folder.glob("*.yaml")} | set(registered)
     raise ConfigError(f"{name}: extends: there is no task or file {shown(parent)}{suggest(parent[:SHOWN], names)}")
 
 
-@dataclass(frozen=True)
-class ClassHint:
-    """Class of the task according to one configuration in a chain of `extends`."""
-
-    where: str
-    """Prefix of error messages about this hint."""
-    task: str | None
-    """Name of the registered task; None for a file. The registration may name a class too."""
-    kind: Any
-    """Value of the key `class`; None without this key."""
-
-
-def class_hints(source: Source, task: str, registered: Mapping[str, Registered]) -> list[ClassHint]:
-    """Return the class hints in a chain of `extends`, beginning with the configuration of `task`."""
-    return [ClassHint(f"{layer.name}: class", layer.task, layer.kind) for layer in _layers(source, task, registered)]
-
-
 def _merged(
-    layers: Iterable[_Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
+    layers: Iterable[Layer], schema: type[TaskConfig], rescale: Rescale | None, robot: str | None, on_cpu: bool
 ) -> tuple[dict[str, Any], Origins]:
     """Merge layers. The values of a layer replace those of the layers that it extends. With `on_cpu`, the `cpu:` section of
     each layer is merged on top of the layer.
@@ -176,7 +151,7 @@ def _merged(
     """
     parts = []
     for layer in reversed(list(layers)):
-        _check_layer(layer.data, layer.name, schema)
+        _check_layer(layer, schema)
         data = copy.deepcopy(dict(layer.data))
         for section in (data, data.get("cpu", {})):
             if "robot" in section:
@@ -214,31 +189,19 @@ def _merged(
     return merged, origins
 
 
-def name_of(source: Source, task: str) -> str:
-    """Return the name of a task's configuration for error messages."""
-    given = source.config if isinstance(source, Registered) else source
-    return str(given) if isinstance(given, Path) else f"registered config of '{task}'"
-
-
-def _check_layer(data: Mapping[str, Any], name: str, schema: type[TaskConfig]) -> None:
+def _check_layer(layer: Layer, schema: type[TaskConfig]) -> None:
     """Check that a layer and its `cpu:` section fit the schema. The section is checked on a GPU machine too.
 
     Raises:
         ConfigError: the layer or the section does not fit.
     """
-    known = {*OF_FILES, *(field.name for field in dataclasses.fields(schema) if field.compare)}
-    for key in data:
-        if key not in known:
-            key_text = plain_path(key)
-            raise ConfigError(f"{name}: {key_text}: unknown key {shown(key)}{suggest(key_text, known)}")
-    build(schema, {key: value for key, value in data.items() if key != "cpu"}, "", Origins(), name)
-    if "cpu" in data:
-        cpu = data["cpu"]
-        if not isinstance(cpu, Mapping):
-            raise ConfigError(f"{name}: cpu: expected a mapping of sections, got {shown(cpu)}")
-        if "task" in cpu:
-            raise ConfigError(f"{name}: cpu: task: a task has the same name on every machine; remove this key")
-        build(schema, cpu, "", Origins(), f"{name}: cpu")
+    name, cpu = layer.name, layer.data.get("cpu", {})
+    build(schema, {key: value for key, value in layer.data.items() if key != "cpu"}, name, others=OF_FILES)
+    if not isinstance(cpu, Mapping):
+        raise ConfigError(f"{name}: cpu: expected a mapping of sections, got {shown(cpu)}")
+    if "task" in cpu:
+        raise ConfigError(f"{name}: cpu: task: a task has the same name on every machine; remove this key")
+    build(schema, cpu, f"{name}: cpu")
 
 
 def robot_path(robot: Any, folder: Path) -> Any:
@@ -299,32 +262,29 @@ def nest(path: str, value: Any) -> dict[str, Any]:
 
 
 def load_config(
-    source: Source,
+    source: Source | list[Layer],
     task: str,
     overrides: Iterable[tuple[str, Any]] = (),
     on_cpu: bool = False,
-    registered: Mapping[str, Registered] | None = None,
     schema: type[TaskConfig] = LeggedConfig,
     rescale: Rescale | None = None,
 ) -> TaskConfig:
     """Load the configuration of a task as an instance of `schema`.
 
-    The file or mapping `source` is merged onto the configurations that it extends, which are files or tasks in `registered`.
-    With `on_cpu`, the `cpu:` section of each configuration is merged too. `overrides` are merged last. `rescale` converts
-    numbers that were written for another robot. It does not change overrides.
+    `source` is a file, a mapping, or a list that `read_layers` has returned. It is merged onto the configurations that it
+    extends. With `on_cpu`, the `cpu:` section of each configuration is merged too. `overrides` are merged last. `rescale`
+    converts numbers that were written for another robot. It does not change overrides.
 
     Raises:
         ConfigError: an unknown key, a wrong type or a wrong value. The message names the file and the setting's dotted path.
     """
-    name = name_of(source, task)
+    layers = source if isinstance(source, list) else read_layers(source, task)
     overrides = list(overrides)
     named = [robot_path(value, Path.cwd()) for key, value in overrides if key == "robot"]
-    robot = named[-1] if named else None
-    data, origins = _merged(_layers(source, task, registered or {}), schema, rescale, robot, on_cpu)
+    data, origins = _merged(layers, schema, rescale, named[-1] if named else None, on_cpu)
     data["task"] = task
-    where = Origins(origins)
-    _merge_overrides(data, overrides, where, schema)
-    return from_dict(data, where, source=name, schema=schema)
+    _merge_overrides(data, overrides, origins, schema)
+    return from_dict(data, origins, source=layers[0].name, schema=schema)
 
 
 def _merge_overrides(
@@ -340,7 +300,7 @@ def _merge_overrides(
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} nested sections")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
         layer = renamed(layer, "command line")
-        build(schema, layer, "", Origins(), "command line")
+        build(schema, layer, "command line")
         actuator_path(layer, Path.cwd())
         motion_paths(layer, Path.cwd())
         merge(data, layer, "command line", origins)
@@ -355,20 +315,18 @@ def from_dict(
     """Build an instance of `schema` from nested plain values. `origins` holds the sources of the values. Without
     `origins`, all values are from `source`.
     """
+    data = data if origins is not None else renamed(data, source)
+    cfg = build(schema, data, source, origins)
     if origins is None:
-        data = renamed(data, source)
         origins = Origins()
         merge({}, data, source, origins)
-    cfg = build(schema, data, "", origins, source)
-    cfg.origins.update(origins)
-    cfg.origins.reference_robots, cfg.origins.rescaled = origins.reference_robots, origins.rescaled
-    return cfg
+    return dataclasses.replace(cfg, origins=origins)
 
 
 def override(cfg: Schema, overrides: Iterable[tuple[str, Any]]) -> Schema:
     """Return a copy of `cfg` with some settings replaced and checked. `overrides` are pairs of a dotted path and a value."""
     data = to_dict(cfg)
-    origins = Origins(cfg.origins)
+    origins = copy.copy(cfg.origins)
     _merge_overrides(data, overrides, origins, type(cfg))
     return from_dict(data, origins, source=cfg.task, schema=type(cfg))  # type: ignore[return-value]
 

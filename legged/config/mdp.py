@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 from legged.config.actuator import LONGEST_DELAY, Steps
-from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry, rescaled_by_term
+from legged.config.bounds import LARGEST, NAMES, TERMS, UNIT, between, positive, rescaled_by_entry
 from legged.config.randomization import DrawConfig, Range
 from legged.config.section import Section
 
@@ -34,13 +34,13 @@ class DomainRandConfig(Section):
     """Domain randomisation of the robots."""
 
     ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges.", between(-LARGEST, LARGEST))
     )
     """Property -> range of a uniform distribution, from which each robot's value is sampled once before training. For another
     distribution or time, the entry is a mapping with `range`, `distribution`, `when` and more (DrawConfig). The properties
     are listed in legged/physics/fields.py."""
     observed_ranges: dict[str, Range | DrawConfig] = field(
-        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges", between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("domain_rand.ranges.", between(-LARGEST, LARGEST))
     )
     """Property -> range that the observation `_obs_rand_<property>` scales to [-1, 1]. By default, this is the
     property's range in `ranges`. Play and evaluation copy the ranges of the training to this setting."""
@@ -55,7 +55,7 @@ class RewardsConfig(Section):
     """Scales of the `_reward_<name>` terms."""
 
     scales: dict[str, float] = field(
-        default_factory=dict, metadata=rescaled_by_term("_reward_", -1, between(-LARGEST, LARGEST))
+        default_factory=dict, metadata=rescaled_by_entry("_reward_", between(-LARGEST, LARGEST), -1)
     )
     """Term -> scale. A scale of 0 switches the term off."""
     times_dt: bool = True
@@ -91,7 +91,7 @@ class ObservationsConfig(Section):
     """Factor on the noise of all terms."""
     noise: dict[str, float] = field(default_factory=dict, metadata=between(0, LARGEST))
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
-    bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)))
+    bias: dict[str, float] = field(default_factory=dict, metadata=rescaled_by_entry("_obs_", between(0, LARGEST)))
     """Term -> half width of its uniform bias, in the term's unit before scaling. Each number of the term has its own bias,
     which is sampled for each episode. Bias, delay and lost packets affect only groups with `noise: true`, and only if
     `add_noise` is true."""

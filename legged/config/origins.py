@@ -1,18 +1,15 @@
 """Sources of a configuration's fields, for errors that name a file."""
 
-from collections.abc import Mapping
+from legged.errors import ConfigError
 
 
 class Origins(dict[str, str]):
     """Map: dotted path -> source of its value, such as 'cfg/mine.yaml', 'cfg/mine.yaml: cpu' or 'command line'."""
 
-    def __init__(self, other: Mapping[str, str] | None = None) -> None:
-        """Copy another map, or begin with an empty one."""
-        super().__init__(other or {})
-        self.reference_robots: tuple[str, ...] = other.reference_robots if isinstance(other, Origins) else ()
-        """Reference robots that files name in `written_for`, each once."""
-        self.rescaled: frozenset[str] = other.rescaled if isinstance(other, Origins) else frozenset()
-        """Sources whose numbers were rescaled from a reference robot (rescale.py)."""
+    reference_robots: tuple[str, ...] = ()
+    """Reference robots that files name in `written_for`, each once."""
+    rescaled: frozenset[str] = frozenset()
+    """Sources whose numbers were rescaled from a reference robot (rescale.py)."""
 
     def note(self, path: str, source: str) -> None:
         """Record that `source` set `path`, and remove the entries of the path's parents and children."""
@@ -33,3 +30,7 @@ class Origins(dict[str, str]):
     def where(self, path: str) -> str:
         """Return the prefix of an error message about `path`, such as 'cfg/mine.yaml: terrain.border_size'."""
         return f"{self.of(path)}: {path}"
+
+    def error(self, path: str, text: str) -> ConfigError:
+        """Return the error that the setting `path` is wrong. `text` gives the reason, the value and the allowed values."""
+        return ConfigError(f"{self.where(path)}: {text}")

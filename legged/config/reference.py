@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Union
 
 from legged.config.bounds import SMALLEST
-from legged.config.checks import hints_of
+from legged.config.checks import SCALARS, hints_of
 from legged.config.loader import to_dict
 
 
@@ -48,12 +48,11 @@ def fields(schema: type, defaults: Any = None, prefix: str = "") -> Iterator[Fie
         hint = hints_of(schema)[field.name]
         meaning = meaning_of(schema, field.name)
         of_entries = typing.get_args(hint)[1] if typing.get_origin(hint) is dict else None
-        if dataclasses.is_dataclass(hint):
+        is_map = dataclasses.is_dataclass(of_entries)
+        if is_map or dataclasses.is_dataclass(hint):
+            path, kind, value = (f"{path}.<name>", of_entries, None) if is_map else (path, hint, value)
             yield FieldText(path, "a section", None, "", "", meaning, is_section=True)
-            yield from fields(typing.cast(type, hint), value, f"{path}.")
-        elif dataclasses.is_dataclass(of_entries):
-            yield FieldText(f"{path}.<name>", "a section", None, "", "", meaning, is_section=True)
-            yield from fields(typing.cast(type, of_entries), None, f"{path}.<name>.")
+            yield from fields(typing.cast(type, kind), value, f"{path}.")
         else:
             literals = [kind for kind in (hint, *typing.get_args(hint)) if typing.get_origin(kind) is Literal]
             choices = ("true", "false") if hint is bool else typing.get_args(literals[0]) if literals else ()
@@ -98,7 +97,7 @@ def kind_of(hint: Any) -> str:
         return "a mapping"
     if origin is dict:
         return f"a map: {kind_of(args[1])} for each name"
-    return {bool: "true or false", int: "a whole number", float: "a number", str: "text", Any: "anything"}[hint]
+    return {**SCALARS, Any: "anything"}[hint]
 
 
 def bounds_of(metadata: Mapping[str, Any]) -> str:

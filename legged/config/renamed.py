@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from legged.config.checks import shown
+from legged.config.dotted import value_at
 from legged.errors import ConfigError
 
 RENAMED = {
@@ -23,50 +24,35 @@ def renamed(data: Mapping[str, Any], source: str) -> dict[str, Any]:
     """Return a copy of `data` with old names replaced.
 
     Raises:
-        ConfigError: `data` has a setting under its old and its new name, or an old setting has an unknown value. The message
-            begins with `source`.
+        ConfigError: a setting has one value under its old name and another one under its new name, or an old setting has an
+            unknown value. The message begins with `source`.
     """
-    result = _replaced(data, source)
-    for old, new in RENAMED.items():
+    result = dict(data)
+    for old in (*RENAMED, *REPLACED):
         section, _, key = old.rpartition(".")
         found = result.get(section)
         if not isinstance(found, Mapping) or key not in found:
             continue
         value = found[key]
         result[section] = {name: item for name, item in found.items() if name != key}
-        _put(result, new.split("."), value, f"{source}: {old}: {shown(value)}: renamed to {new}, which is set too")
-    return result
-
-
-def _replaced(data: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return a copy of `data` in which each setting of REPLACED is converted to its successor."""
-    result = dict(data)
-    for old, (new, meanings) in REPLACED.items():
-        section, _, key = old.rpartition(".")
-        found = result.get(section)
-        if not isinstance(found, Mapping) or key not in found:
+        where = f"{source}: {old}: {shown(value)}"
+        if old in RENAMED:
+            _put(result, RENAMED[old], value, f"{where}: renamed to {RENAMED[old]}, which is set too")
             continue
-        value, name = found[key], new.rpartition(".")[2]
-        rest = {other: item for other, item in found.items() if other != key}
+        new, meanings = REPLACED[old]
         if not isinstance(value, str) or value not in meanings:
             raise ConfigError(f"{source}: {old}: replaced by {new}, which can be auto, fused or library; got {shown(value)}")
-        meaning = meanings[value]
-        if meaning is not None and rest.get(name, meaning) != meaning:
-            raise ConfigError(f"{source}: {old}: {shown(value)} now means {new}={meaning}, but {new} is {shown(rest[name])}")
-        result[section] = rest if meaning is None else {**rest, name: meaning}
+        if (meaning := meanings[value]) is not None:
+            _put(result, new, meaning, f"{where} now means {new}={meaning}, but {new} is {shown(value_at(result, new))}")
     return result
 
 
-def _put(data: dict[str, Any], path: list[str], value: Any, conflict: str) -> None:
-    """Set the value at a path of keys. Maps on the path are copied. An existing value raises ConfigError(conflict)."""
-    key, *rest = path
-    if not rest:
-        if key in data:
-            raise ConfigError(conflict)
-        data[key] = value
-        return
-    inner = data.get(key, {})
-    if not isinstance(inner, Mapping):
+def _put(data: dict[str, Any], path: str, value: Any, conflict: str) -> None:
+    """Set the value at a dotted path. Maps on the path are copied. Another value there raises ConfigError(conflict)."""
+    key, _, rest = path.partition(".")
+    there = data.get(key, {} if rest else value)
+    if not (isinstance(there, Mapping) if rest else there == value):
         raise ConfigError(conflict)
-    data[key] = dict(inner)
-    _put(data[key], rest, value, conflict)
+    data[key] = dict(there) if rest else value
+    if rest:
+        _put(data[key], rest, value, conflict)

@@ -37,17 +37,11 @@ def rescale(data: Mapping[str, Any], schema: type, factor: Factor, unit_of: Unit
             rescaled[key] = {
                 term: _times_entry(number, factor(unit_of(prefix + term)) ** power) for term, number in value.items()
             }
-        elif _of_sections(hints[key]):
-            kind = typing.get_args(hints[key])[1]
-            rescaled[key] = {name: rescale(section, kind, factor, unit_of) for name, section in value.items()}
+        elif typing.get_origin(hints[key]) is dict and dataclasses.is_dataclass(kind := typing.get_args(hints[key])[1]):
+            rescaled[key] = {name: rescale(section, kind, factor, unit_of) for name, section in value.items()}  # type: ignore[arg-type]
         else:
             rescaled[key] = value
     return rescaled
-
-
-def _of_sections(hint: Any) -> bool:
-    """Return True if a field is a map of sections."""
-    return typing.get_origin(hint) is dict and dataclasses.is_dataclass(typing.get_args(hint)[1])
 
 
 def _times_entry(value: Any, by: float) -> Any:

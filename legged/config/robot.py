@@ -18,7 +18,6 @@ from legged.config.bounds import (
     quantity,
     rescaled,
     rescaled_by_entry,
-    rescaled_by_term,
 )
 from legged.config.mdp import (
     ControlConfig,
@@ -52,7 +51,7 @@ class TerrainConfig(Section):
     """Factor on all lengths of the terrain types; 1 suits a robot that is half a metre high."""
     proportions: dict[str, float] = field(default_factory=dict, metadata=UNIT)
     """Terrain type -> share of the columns; the shares sum to 1. Types: legged/terrain/generators.py, TERRAIN_TYPES."""
-    sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes", positive(100)))
+    sizes: dict[str, float | Range] = field(default_factory=dict, metadata=rescaled_by_entry("terrain.sizes.", positive(100)))
     """Terrain type -> size of all its tiles, or range [low, high] of their sizes, in the type's unit. In a range the
     size changes linearly, from the easier end at difficulty 0 to the harder end at difficulty 1. An entry replaces the type's
     default sizes."""
@@ -235,7 +234,7 @@ class RobotObservationsConfig(ObservationsConfig):
 
     scales: dict[str, float] = field(
         default_factory=lambda: {"base_lin_vel": 2.0, "base_ang_vel": 0.25, "dof_vel": 0.05, "heights": 5.0},
-        metadata=rescaled_by_term("_obs_", -1, between(-LARGEST, LARGEST)),
+        metadata=rescaled_by_entry("_obs_", between(-LARGEST, LARGEST), -1),
     )
     """Term -> factor. Without an entry, `commands` have the factors of base_lin_vel and base_ang_vel; other terms have 1."""
     noise: dict[str, float] = field(
@@ -247,7 +246,7 @@ class RobotObservationsConfig(ObservationsConfig):
             "dof_vel": 1.5,
             "heights": 0.1,
         },
-        metadata=rescaled_by_term("_obs_", 1, between(0, LARGEST)),
+        metadata=rescaled_by_entry("_obs_", between(0, LARGEST)),
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
     heights_offset: float = field(default=0.5, metadata=rescaled("m", between(-100, 100)))

@@ -1,8 +1,7 @@
 """Conversion between YAML texts and plain values. An error message names the file and, if known, the line of the mistake."""
 
-import contextlib
+import functools
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,45 +24,41 @@ class _Loader(yaml.SafeLoader):
     repeated keys, whole numbers that differ between YAML 1.1 and 1.2, deep nesting, and too many values.
     """
 
-    def get_single_node(self) -> yaml.Node | None:
-        self._sizes: dict[int, tuple[int, int] | None] = {}
-        node: yaml.Node | None = super().get_single_node()
-        if node is not None:
-            self._measure(node)
-        return node
+    def __init__(self, source: str, text: str) -> None:
+        super().__init__(text)
+        self.name = source
+        self._open = 0
+        """Number of blocks around the present node."""
+        self._sizes: dict[int, tuple[int, int]] = {}
+        """Id of a node -> number of values in it and depth of its nesting, both after aliases are expanded."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node as SafeLoader does. Refuse deep nesting, which would exceed Python's recursion limit."""
-        self._depth = getattr(self, "_depth", 0) + 1
-        if self._depth > DEEPEST:
-            raise yaml.MarkedYAMLError(problem=f"more than {DEEPEST} nested blocks", problem_mark=self.get_mark())
-        try:
-            return super().compose_node(parent, index)  # type: ignore[no-any-return]
-        finally:
-            self._depth -= 1
-
-    def _measure(self, node: yaml.Node) -> tuple[int, int]:
-        """Return the number of values in a node and the depth of its nesting, both after aliases are expanded."""
-        if isinstance(node, yaml.ScalarNode):
-            return 1, 1
-        if id(node) in self._sizes:
-            known = self._sizes[id(node)]
-            if known is None:
-                self._refuse("an anchor refers to itself", node)
-            return known  # type: ignore[return-value]
-        self._sizes[id(node)] = None
-        inner = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
-        parts = [self._measure(part) for part in inner]
-        size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
-        if size > MOST_VALUES or depth > DEEPEST:
-            self._refuse(f"more than {MOST_VALUES} values or {DEEPEST} nested blocks after aliases are expanded", node)
-        self._sizes[id(node)] = size, depth
+        """Compose a node as SafeLoader does, and measure it. Repeated keys are refused before merge keys (`<<`) are expanded,
+        because a block may override a merged key.
+        """
+        is_alias = self.check_event(yaml.AliasEvent)
+        self._open += 1
+        if self._open > DEEPEST:  # a deeper nesting would exceed Python's recursion limit
+            self._refuse(f"more than {DEEPEST} nested blocks", self.get_mark())
+        node = super().compose_node(parent, index)
+        self._open -= 1
+        if is_alias:
+            if id(node) not in self._sizes:
+                self._refuse("an anchor refers to itself", self.get_mark())
+            return node
+        inner = node.value if isinstance(node, yaml.SequenceNode) else []
         if isinstance(node, yaml.MappingNode):
             self._refuse_key_given_twice(node)
-        return size, depth
+            inner = [part for pair in node.value for part in pair]
+        parts = [self._sizes[id(part)] for part in inner]
+        size, depth = 1 + sum(part[0] for part in parts), 1 + max((part[1] for part in parts), default=0)
+        if size > MOST_VALUES or depth > DEEPEST:
+            limits = f"{MOST_VALUES} values or {DEEPEST} nested blocks"
+            self._refuse(f"more than {limits} after aliases are expanded", self.get_mark())
+        self._sizes[id(node)] = size, depth
+        return node
 
     def _refuse_key_given_twice(self, node: yaml.MappingNode) -> None:
-        """Refuse a repeated key. Called before merge keys (`<<`) are expanded, because a block may override a merged key."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode):
@@ -72,8 +67,8 @@ class _Loader(yaml.SafeLoader):
                     raise ConfigError(f"{self.name}: key '{key.value}' is given twice in the block from line {line}")
                 seen.add((key.tag, key.value))
 
-    def _refuse(self, problem: str, node: yaml.Node) -> None:
-        raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+    def _refuse(self, problem: str, mark: Any) -> None:
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         """Construct a whole number. Refuse one that YAML 1.1 reads as octal (leading 0) or base 60 (colon)."""
@@ -88,8 +83,6 @@ class _Loader(yaml.SafeLoader):
         try:
             return super().construct_object(node, deep)
         except (ValueError, OverflowError) as error:
-            if isinstance(error, ConfigError):
-                raise
             what = shown(node.value) if isinstance(node, yaml.ScalarNode) else "a value"
             raise yaml.MarkedYAMLError(problem=f"{what} cannot be read ({error})", problem_mark=node.start_mark) from error
 
@@ -141,29 +134,18 @@ def parse(text: str, source: str) -> Any:
     Raises:
         ConfigError: the text is malformed, has an anchor that refers to itself, or is too large after aliases are expanded.
     """
-    with _as_one_line(source):
-        loader = _Loader(text)
-        loader.name = source
-        try:
-            return loader.get_single_data()
-        finally:
-            loader.dispose()
+    try:
+        return yaml.load(text, functools.partial(_Loader, source))  # type: ignore[arg-type]
+    except yaml.YAMLError as error:
+        said, where = str(error), ""
+        if isinstance(error, yaml.MarkedYAMLError):
+            said = ", ".join(part for part in (error.context, error.problem) if part)
+            mark = error.problem_mark or error.context_mark
+            where = f" (line {mark.line + 1}, column {mark.column + 1})" if mark else ""
+        raise ConfigError(f"{source}: not valid YAML: {' '.join(said.split())}{where}") from error
 
 
 def dump(value: Any, **style: Any) -> str:
     """Return a plain value as a YAML text, which `parse` can read. `style` has options of yaml.dump."""
     text: str = yaml.dump(value, Dumper=_Dumper, **style)
     return text
-
-
-@contextlib.contextmanager
-def _as_one_line(source: str) -> Iterator[None]:
-    try:
-        yield
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f" (line {mark.line + 1}, column {mark.column + 1})" if mark else ""
-        text = ", ".join(part for part in (error.context, error.problem) if part)
-        raise ConfigError(f"{source}: not valid YAML: {' '.join(text.split())}{where}") from error
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{source}: not valid YAML: {' '.join(str(error).split())}") from error

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config.networks import groups_in
-from legged.config.schema import TaskConfig
+from legged.config.task import TaskConfig
 from legged.envs.actions import as_actions, ordinary_tensors
 from legged.envs.checks import check_task
 from legged.envs.concurrent_terms import ConcurrentTerms

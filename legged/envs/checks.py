@@ -1,20 +1,16 @@
 """Checks of settings that are valid by themselves but may not fit each other or the task class."""
 
-from collections.abc import Iterable, Mapping
 from itertools import pairwise
-from typing import get_args
+from operator import attrgetter
+from typing import Any
 
 from legged.config.legged import follows_velocities
 from legged.config.networks import check_networks, learns_from_teacher
-from legged.config.schema import TaskConfig
-from legged.envs.class_checks import check_overrides, check_terms
+from legged.config.task import TaskConfig
+from legged.envs.class_checks import check_class, check_terms
 from legged.envs.randomization_checks import check_observed, check_randomization
 from legged.errors import ConfigError, suggest
-from legged.mdp.mirror_images import MirrorKind
-from legged.physics.quantities import LAST_STEP, STAGES
 
-RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
-"""Names of metrics that every task logs."""
 FOLLOWING = ("lin_vel_rmse", "ang_vel_rmse", "falls", "return")
 """Figures that evaluations during training report for robots that follow commands. By default, the first one decides which
 policy is the best.
@@ -30,33 +26,34 @@ MOST_WEIGHTS = 2**30
 moments take 16 GiB."""
 
 
-def check_task(cls: type, cfg: TaskConfig) -> None:
+def check_task(cls: Any, cfg: TaskConfig) -> None:
     """Check the parts of a configuration that do not depend on a robot, for a task of class `cls`.
 
     Raises:
         ConfigError: a setting does not fit the class or another setting.
     """
-    check_overrides(cls)
+    check_class(cls)
     check_terms(cls, cfg)
     if cfg.train.algorithm.symmetry and not hasattr(cls, "MIRRORED"):
-        where = cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {cls.__name__} has no mirror images (table MIRRORED); set symmetry to false")
+        text = f"{cls.__name__} has no mirror images (table MIRRORED); set symmetry to false"
+        raise cfg.origins.error("train.algorithm.symmetry", text)
     check_networks(cfg)
-    for name in RESERVED & cls.terms("_metric_"):  # type: ignore[attr-defined]
-        raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; rename the method")
-    for name in cfg.terminations.failures:
-        if name in cfg.terminations.time_outs:
-            where = cfg.origins.where("terminations.time_outs")
-            raise ConfigError(f"{where}: '{name}' is also in terminations.failures; remove it from one of the two")
-    for name in cls.QUANTITIES:  # type: ignore[attr-defined]
-        if name not in (*STAGES, *LAST_STEP):
-            known = suggest(name, (*STAGES, *LAST_STEP), "quantities")
-            raise ConfigError(f"{cls.__name__}.QUANTITIES: there is no quantity '{name}'{known}")
     check_randomization(cfg)
     check_observed(cfg)
     check_sizes(cfg)
-    check_lengths(cfg)
     check_evaluation(cls, cfg)
+
+
+def check_rewards(cls: Any, cfg: TaskConfig) -> None:
+    """Check that a task that is trained from rewards has a reward, unless its class overrides `compute_reward`.
+
+    Raises:
+        ConfigError: all scales are 0, or `rewards.scales` is empty.
+    """
+    own = not cls.compute_reward.__module__.startswith("legged.")
+    if not (own or learns_from_teacher(cfg) or any(cfg.rewards.scales.values())):
+        known = ", ".join(sorted(cls.terms("_reward_")))
+        raise ConfigError(f"{cfg.task}: rewards.scales: no reward has a scale other than 0 (rewards: {known})")
 
 
 def evaluated_figures(cls: type, cfg: TaskConfig) -> tuple[str, ...]:
@@ -76,8 +73,7 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
     """Check the settings of evaluations during training.
 
     Raises:
-        ConfigError: best_by or stop_at names an unknown figure, stop_at is set but evaluate_interval is not, or an evaluation
-            is shorter than a control step.
+        ConfigError: best_by or stop_at names an unknown figure, or stop_at is set but evaluate_interval is not.
     """
     runner, figures = cfg.train.runner, evaluated_figures(cls, cfg)
     asked = {f"train.runner.stop_at.{name}": name for name in runner.stop_at}
@@ -85,82 +81,40 @@ def check_evaluation(cls: type, cfg: TaskConfig) -> None:
         asked["train.runner.best_by"] = runner.best_by
     for path, name in asked.items():
         if name not in figures:
-            where = cfg.origins.where(path)
-            raise ConfigError(f"{where}: evaluations of '{cfg.task}' report no {name!r}{suggest(name, figures, 'figures')}")
+            unknown = f"evaluations of '{cfg.task}' report no {name!r}{suggest(name, figures, 'figures')}"
+            raise cfg.origins.error(path, unknown)
     if runner.stop_at and not runner.evaluate_interval:
-        where = cfg.origins.where("train.runner.stop_at")
-        raise ConfigError(f"{where}: needs evaluations during training; set train.runner.evaluate_interval, such as 50")
-    if runner.evaluate_interval and runner.evaluate_s and round(runner.evaluate_s / cfg.dt) < 1:
-        where, given = cfg.origins.where("train.runner.evaluate_s"), runner.evaluate_s
-        raise ConfigError(
-            f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), or 0, got {given:g}"
-        )
-
-
-def check_lengths(cfg: TaskConfig) -> None:
-    """Check that an episode has at least one control step, and a mini-batch at least one sample.
-
-    Raises:
-        ConfigError: an episode or a mini-batch is too short.
-    """
-    origins = cfg.origins
-    if round(cfg.env.episode_length_s / cfg.dt) < 1:
-        where, given = origins.where("env.episode_length_s"), cfg.env.episode_length_s
-        raise ConfigError(
-            f"{where}: must be at least a control step of {cfg.dt:g} s (sim.dt * control.decimation), got {given:g}"
-        )
-    samples = cfg.env.num_envs * cfg.train.runner.num_steps_per_env
-    if cfg.train.algorithm.num_mini_batches > samples and not learns_from_teacher(cfg):
-        where, given = origins.where("train.algorithm.num_mini_batches"), cfg.train.algorithm.num_mini_batches
-        raise ConfigError(
-            f"{where}: must be at most the {samples} samples of an iteration (num_envs * num_steps_per_env), got {given}"
-        )
+        needs = "needs evaluations during training; set train.runner.evaluate_interval, such as 50"
+        raise cfg.origins.error("train.runner.stop_at", needs)
 
 
 def check_sizes(cfg: TaskConfig) -> None:
-    """Check that contacts, samples and weights do not exceed MOST_IN_A_POOL, MOST_SAMPLES and MOST_WEIGHTS.
+    """Check that an episode and an evaluation have at least one control step, a mini-batch at least one sample, and that
+    contacts, samples and weights do not exceed MOST_IN_A_POOL, MOST_SAMPLES and MOST_WEIGHTS.
 
     Raises:
-        ConfigError: a size is too large.
+        ConfigError: a size is too small or too large.
     """
-    robots, steps = cfg.env.num_envs, cfg.train.runner.num_steps_per_env
-    for field in ("nconmax", "njmax"):
-        size = robots * getattr(cfg.sim, field)
-        if size > MOST_IN_A_POOL:
-            raise ConfigError(
-                f"{cfg.origins.where(f'sim.{field}')}: {getattr(cfg.sim, field)} for each of {robots} robots (env.num_envs:"
-                f" {cfg.origins.of('env.num_envs')}) make {size:,} in total, more than {MOST_IN_A_POOL:,}"
-            )
-    if robots * steps > MOST_SAMPLES:
-        raise ConfigError(
-            f"{cfg.origins.where('train.runner.num_steps_per_env')}: {steps} steps of {robots} robots (env.num_envs:"
-            f" {cfg.origins.of('env.num_envs')}) are {robots * steps:,} samples per iteration, more than {MOST_SAMPLES:,}"
-        )
-    policy = cfg.train.policy
-    for field, widths in (
-        ("actor_hidden_dims", policy.actor_hidden_dims),
-        ("critic_hidden_dims", policy.critic_hidden_dims),
-        ("estimator.hidden_dims", policy.estimator.hidden_dims),
-    ):
-        weights = sum(a * b for a, b in pairwise(widths))
+    runner, error = cfg.train.runner, cfg.origins.error
+    lengths = {"env.episode_length_s": (cfg.env.episode_length_s, "")}
+    if runner.evaluate_interval and runner.evaluate_s:
+        lengths["train.runner.evaluate_s"] = runner.evaluate_s, ", or 0"
+    for path, (given, otherwise) in lengths.items():
+        if round(given / cfg.dt) < 1:
+            step = f"a control step of {cfg.dt:g} s (sim.dt * control.decimation)"
+            raise error(path, f"must be at least {step}{otherwise}, got {given:g}")
+    robots, steps, batches = cfg.env.num_envs, runner.num_steps_per_env, cfg.train.algorithm.num_mini_batches
+    samples, of_robots = robots * steps, f"{robots} robots (env.num_envs: {cfg.origins.of('env.num_envs')})"
+    if batches > samples and not learns_from_teacher(cfg):
+        most = f"the {samples} samples of an iteration (num_envs * num_steps_per_env)"
+        raise error("train.algorithm.num_mini_batches", f"must be at most {most}, got {batches}")
+    for path, each in (("sim.nconmax", cfg.sim.nconmax), ("sim.njmax", cfg.sim.njmax)):
+        if (size := robots * each) > MOST_IN_A_POOL:
+            raise error(path, f"{each} for each of {of_robots} make {size:,} in total, more than {MOST_IN_A_POOL:,}")
+    if samples > MOST_SAMPLES:
+        many = f"{steps} steps of {of_robots} are {samples:,} samples per iteration, more than {MOST_SAMPLES:,}"
+        raise error("train.runner.num_steps_per_env", many)
+    for field in ("actor_hidden_dims", "critic_hidden_dims", "estimator.hidden_dims"):
+        weights = sum(a * b for a, b in pairwise(attrgetter(field)(cfg.train.policy)))
         if weights > MOST_WEIGHTS:
-            where = cfg.origins.where(f"train.policy.{field}")
-            raise ConfigError(f"{where}: these widths make {weights:,} weights, more than {MOST_WEIGHTS:,}")
-
-
-def check_mirror_kinds(task: str, mirrored: Mapping[str, str], used: Iterable[str], where: str) -> None:
-    """Check that the table `mirrored` gives a valid kind of mirroring for every observation in `used`. `mirrored` is the
-    table MIRRORED of the class `task`. Error messages begin with `where`.
-
-    Raises:
-        ConfigError: an observation has no kind, or an unknown kind.
-    """
-    otherwise = "set train.algorithm.symmetry=false to learn without mirror images"
-    kinds = get_args(MirrorKind)
-    for name in used:
-        if name not in mirrored:
-            missing = f"{task}.MIRRORED does not say how observation '{name}' is mirrored"
-            raise ConfigError(f"{where}: {missing}; {otherwise}")
-        if mirrored[name] not in kinds:
-            unknown = f"{task}.MIRRORED: observation '{name}' has the unknown kind {mirrored[name]!r}"
-            raise ConfigError(f"{where}: {unknown}{suggest(str(mirrored[name]), kinds, 'kinds')}; {otherwise}")
+            raise error(f"train.policy.{field}", f"these widths make {weights:,} weights, more than {MOST_WEIGHTS:,}")

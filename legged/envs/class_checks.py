@@ -2,6 +2,7 @@
 methods.
 """
 
+import dataclasses
 import inspect
 import re
 from pathlib import Path
@@ -9,9 +10,10 @@ from types import CodeType
 from typing import Any
 
 from legged.config.networks import groups_in, path_of_terms
-from legged.config.origins import Origins
-from legged.config.schema import TaskConfig
+from legged.config.task import TaskConfig
+from legged.envs.marks import unit_of
 from legged.errors import LONGEST, ConfigError, suggest
+from legged.physics.quantities import check_quantities
 from legged.process.paths import relative
 
 _OBSERVE = "write a method _obs_<name> for each observation; list <name> in observations.groups.actor.terms and .critic.terms"
@@ -91,16 +93,28 @@ EXTENDED = {
     "reset_idx": "otherwise no episode would begin",
 }
 """Hook whose override must call super()'s method -> effect of a missing call."""
+RESERVED = {"falls", "episode_length", "non_finite_worlds", "contact_overflows"}
+"""Names of metrics that every task logs."""
 
 
-def check_overrides(cls: type) -> None:
-    """Check the methods of a user's task class, and of its parents that do not belong to this package.
+def check_class(cls: Any) -> None:
+    """Check a task class, and its parents that do not belong to this package.
 
     Raises:
         ConfigError: training would never call a method, and OWN_HELPERS does not list it; an override of a hook in EXTENDED
             does not call super()'s method; or a constructor takes other arguments than (self, cfg, device, graph). The text
-            names all of these methods.
+            names all of these methods. Or else a metric has a name in RESERVED, or a quantity in QUANTITIES does not exist.
     """
+    _check_overrides(cls)
+    for name in RESERVED & cls.terms("_metric_"):
+        raise ConfigError(f"{cls.__name__}._metric_{name}: every task logs Metrics/{name} already; rename the method")
+    try:
+        check_quantities(cls.QUANTITIES)
+    except ValueError as error:
+        raise ConfigError(f"{cls.__name__}.QUANTITIES: {error}") from error
+
+
+def _check_overrides(cls: type) -> None:
     base = next(part for part in cls.__mro__ if part.__module__.startswith("legged."))
     between = [part for part in cls.__mro__ if part not in base.__mro__]
     helpers: set[str] = set()
@@ -194,44 +208,66 @@ def named_terms(cfg: TaskConfig) -> list[tuple[str, str, str]]:
 
 
 def check_terms(cls: Any, cfg: TaskConfig) -> None:
-    """Check that the terms that a configuration names exist and can be called.
+    """Check that the terms that a configuration names exist and can be called, and that they declare a unit where one is
+    needed.
 
     Raises:
-        ConfigError: a term is missing, is not a method, or takes arguments; or a group has no observations.
+        ConfigError: a term is missing, is not a method, or takes arguments; a group has no observations; a termination is a
+            failure and a time-out; or a term in use has a number other than 0 that was rescaled from another robot, but
+            declares no unit.
     """
-    groups = cfg.observations.groups
+    groups, error = cfg.observations.groups, cfg.origins.error
     for group in groups or ("actor",):
         if not groups or not groups[group].terms:
-            where = cfg.origins.where(f"observations.groups.{group}.terms")
-            raise ConfigError(f"{where}: must not be empty{suggest('', cls.terms('_obs_'), 'observations')}")
+            empty = f"must not be empty{suggest('', cls.terms('_obs_'), 'observations')}"
+            raise error(f"observations.groups.{group}.terms", empty)
     for prefix, name, path in named_terms(cfg):
         known = cls.terms(prefix)
         if name not in known:
-            kind = KINDS[prefix]
-            raise ConfigError(f"{cfg.origins.where(path)}: {cls.__name__} has no {kind} '{name}'{suggest(name, known)}")
-        _check_term(cls, prefix + name, path, cfg.origins)
+            raise error(path, f"{cls.__name__} has no {KINDS[prefix]} '{name}'{suggest(name, known)}")
+        if fault := _term_fault(cls, prefix + name):
+            raise error(path, f"{cls.__name__}.{prefix}{name} {fault}")
+    for name in cfg.terminations.failures:
+        if name in cfg.terminations.time_outs:
+            twice = f"'{name}' is also in terminations.failures; remove it from one of the two"
+            raise error("terminations.time_outs", twice)
+    _check_units(cls, cfg)
 
 
-def _check_term(cls: type, name: str, path: str, origins: Origins) -> None:
-    """Check the method `name` of a term. `path` is the dotted path of the setting that names the term.
-
-    Raises:
-        ConfigError: the term is not a method, or takes arguments.
-    """
+def _term_fault(cls: type, name: str) -> str:
+    """Return why the attribute `name` of a class is not the method of a term; empty if it is one."""
     found = inspect.getattr_static(cls, name)
-    where = f"{origins.where(path)}: {cls.__name__}.{name}"
     if isinstance(found, property) or not callable(getattr(cls, name)):
-        raise ConfigError(f"{where} is not a method but a {type(found).__name__}; a term is a method without arguments")
+        return f"is not a method but a {type(found).__name__}; a term is a method without arguments"
     # The signature of a plain method begins with `self`. The signature of a static or class method has only the arguments.
     bound = isinstance(found, classmethod | staticmethod)
     parameters = list(inspect.signature(getattr(cls, name)).parameters.values())
+    if not bound and not (parameters and parameters[0].kind is not parameters[0].KEYWORD_ONLY):
+        return "takes no self; a term is a method with self as its only argument"
     needed = [p.name for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    takes_self = bool(parameters) and parameters[0].kind is not parameters[0].KEYWORD_ONLY
-    if not bound and not takes_self:
-        raise ConfigError(f"{where} takes no self; a term is a method with self as its only argument")
-    if needed[0 if bound else 1 :]:
-        listed = ", ".join(needed[0 if bound else 1 :])
-        raise ConfigError(f"{where} takes arguments ({listed}); a term takes only self, and reads the task's tensors")
+    listed = ", ".join(needed[0 if bound else 1 :])
+    return f"takes arguments ({listed}); a term takes only self, and reads the task's tensors" if listed else ""
+
+
+def _check_units(cls: Any, cfg: TaskConfig) -> None:
+    """Check that every term in use whose number was rescaled from another robot declares its unit."""
+    used = {"_reward_": set(cfg.rewards.scales), "_obs_": {name for g in groups_in(cfg).values() for name in g.terms}}
+    fields = [(part, field) for part in ("rewards", "observations") for field in dataclasses.fields(getattr(cfg, part))]
+    for section, field in fields:
+        prefix, _ = field.metadata.get("unit_of", ("", 1))
+        entries = getattr(getattr(cfg, section), field.name) if prefix in used else {}
+        for name in (name for name, number in entries.items() if number and name in used[prefix]):
+            path, method = f"{section}.{field.name}.{name}", f"{prefix}{name}"
+            if cfg.origins.of(path) not in cfg.origins.rescaled or unit_of(getattr(cls, method)) is not None:
+                continue
+            parents = (unit_of(getattr(part, method, None)) for part in cls.__mro__)
+            example = next((unit for unit in parents if unit is not None), "m^2/s^2")
+            raise cfg.origins.error(
+                path,
+                f"the number is rescaled from another robot, but {cls.__name__}.{method} declares no unit. Write"
+                f' @unit("{example}") above the method, with the unit of its return value (from legged import unit). For a'
+                ' value without a unit, write @unit("1"). A unit in the docstring is not read',
+            )
 
 
 def place(cls: type, attribute: Any) -> str:

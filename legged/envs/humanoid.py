@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from legged.config.bounds import between, quantity
-from legged.config.schema import Range, TaskConfig
+from legged.config.randomization import Range
+from legged.config.task import TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.gymnasium_models import gymnasium_model
 from legged.envs.marks import concurrent, unit

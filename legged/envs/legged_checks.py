@@ -1,25 +1,27 @@
 """Checks of a robot's settings that are valid by themselves but may not fit each other or the robot."""
 
-from typing import Any
+from typing import Any, get_args
 
 from legged.config.checks import shown
+from legged.config.legged import LeggedConfig
 from legged.config.networks import groups_in, path_of_terms
 from legged.config.randomization import draw_of
-from legged.config.schema import LeggedConfig, RobotConfig
-from legged.envs.checks import check_mirror_kinds
+from legged.config.robot import RobotConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
-from legged.errors import ConfigError
+from legged.errors import ConfigError, suggest
 from legged.mdp.actuators.actuator import check_actuator
 from legged.mdp.actuators.motor_curve import check_motor_model, check_slowest
 from legged.mdp.control import acted_joints, action_scales, check_wheels, control_gains
-from legged.mdp.mirror_images import mirror_of_actions
+from legged.mdp.mirror_images import MirrorKind, mirror_of_actions
 from legged.physics.fields import FIELDS
 from legged.robots.robot import Robot
 from legged.terrain import check_terrain
 
 MOST_POINTS = 10_000
 """Largest number of points in the height scan."""
+MOST_VALUES = 10_000
+"""Largest number of values of an axis of commands."""
 
 
 def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
@@ -31,7 +33,6 @@ def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
     if cfg.train.algorithm.symmetry:
         check_symmetry(cls, cfg, robot)
     control_gains(robot, cfg.control, cfg.origins.where)
-    check_passive(cfg, robot)
     action_scales(robot, cfg.control, cfg.origins.where)
     check_wheels(robot, cfg.control, cfg.origins.where)
     check_actuator(robot, cfg.control, cfg.sim.dt, cfg.origins)
@@ -40,9 +41,8 @@ def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
         lowest = draw_of(cfg.domain_rand.ranges["velocity_limit"]).range[0]
         check_slowest(robot, cfg.control, cfg.sim.dt, lowest, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
-    check_base_mass(cfg, robot)
     check_disturbances(cfg, robot)
-    check_points(cfg)
+    check_robot(cfg, robot)
 
 
 def check_symmetry(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
@@ -51,41 +51,46 @@ def check_symmetry(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
     Raises:
         ConfigError: one of them has no mirror image.
     """
-    origins = cfg.origins
-    where, otherwise = (
-        origins.where("train.algorithm.symmetry"),
-        "set train.algorithm.symmetry=false to learn without mirror images",
-    )
+    origins, path = cfg.origins, "train.algorithm.symmetry"
+    otherwise = f"set {path}=false to learn without mirror images"
+
+    def fault(text: str) -> ConfigError:
+        return origins.error(path, f"{text}; {otherwise}")
+
     if robot.mirror is None:
-        raise ConfigError(f"{where}: left and right of '{robot.name}' are not symmetric (at zero joint angles); {otherwise}")
+        raise fault(f"left and right of '{robot.name}' are not symmetric (at zero joint angles)")
     uneven = robot.mirror.uneven_joint(robot.default_dof_pos)
     if uneven is not None:  # the observation `dof_pos` and the actions are relative to this pose, so it must be symmetric too
         partner = robot.mirror.joints[uneven]
         angles = ", ".join(f"{robot.joint_names[i]} {robot.default_dof_pos[i]:g} rad" for i in sorted({uneven, partner}))
-        raise ConfigError(
-            f"{where}: left and right default_joint_angles of '{robot.name}' are not symmetric ({angles}); {otherwise}"
-        )
+        raise fault(f"left and right default_joint_angles of '{robot.name}' are not symmetric ({angles})")
     acted = acted_joints(robot, cfg.control, origins.where)
     image = mirror_of_actions(robot.mirror, acted)
     if image is None:
-        raise ConfigError(f"{origins.where('control.held')}: joints are held on one side only; {otherwise} ({where})")
+        raise origins.error("control.held", f"joints are held on one side only; {otherwise} ({origins.where(path)})")
     laws = robot.each(cfg.control.control_type, origins.where("control.control_type"))[list(acted)].tolist()
     scales = action_scales(robot, cfg.control, origins.where).tolist()
     for field, values in (("control_type", laws), ("action_scale", scales)):
         for i, partner in enumerate(image[0]):
             if values[i] != values[partner]:
                 pair = ", ".join(f"{robot.joint_names[acted[k]]} {shown(values[k])}" for k in sorted((i, partner)))
-                place = origins.where(f"control.{field}")
-                raise ConfigError(f"{place}: left and right joints have different values ({pair}); {otherwise} ({where})")
+                text = f"left and right joints have different values ({pair}); {otherwise} ({origins.where(path)})"
+                raise origins.error(f"control.{field}", text)
     used = [term for group in groups_in(cfg).values() for term in group.terms]
-    check_mirror_kinds(cls.__name__, cls.MIRRORED, used, where)
+    kinds = get_args(MirrorKind)
+    for name in used:
+        if name not in cls.MIRRORED:
+            raise fault(f"{cls.__name__}.MIRRORED does not say how observation '{name}' is mirrored")
+        if (kind := cls.MIRRORED[name]) not in kinds:
+            near = suggest(str(kind), kinds, "kinds")
+            raise fault(f"{cls.__name__}.MIRRORED: observation '{name}' has the unknown kind {kind!r}{near}")
     for name in FIELDS:
         if f"{PREFIX}{name}" in used:
             check_mirrored_draw(cfg, robot, name)
     y = cfg.terrain.measured_points_y
     if sorted(y) != sorted(-value for value in y):
         points = f"terrain.measured_points_y ({origins.of('terrain.measured_points_y')})"
-        raise ConfigError(f"{where}: {points} must be symmetric about 0, got {list(y)}")
+        raise origins.error(path, f"{points} must be symmetric about 0, got {list(y)}")
 
 
 def check_mirrored_draw(cfg: RobotConfig, robot: Robot, name: str) -> None:
@@ -105,65 +110,47 @@ def check_mirrored_draw(cfg: RobotConfig, robot: Robot, name: str) -> None:
     unpaired = each and (kind == "scalar" or (kind == "of_joints" and passive))
     if unpaired or (kind == "joints" and not each):
         table = "ranges" if name in cfg.domain_rand.ranges else "observed_ranges"
-        where = cfg.origins.where(f"domain_rand.{table}.{name}.each")
         what = f"numbers for each of the {FIELDS[name].what} have" if each else "one number for all joints has"
-        raise ConfigError(
-            f"{where}: {PREFIX}{name} is observed, and {what} no mirror image; set each to {str(not each).lower()}, or set"
-            " train.algorithm.symmetry=false to learn without mirror images"
+        raise cfg.origins.error(
+            f"domain_rand.{table}.{name}.each",
+            f"{PREFIX}{name} is observed, and {what} no mirror image; set each to {str(not each).lower()}, or set"
+            " train.algorithm.symmetry=false to learn without mirror images",
         )
 
 
-def check_passive(cfg: RobotConfig, robot: Robot) -> None:
-    """Check that passive joints are observed only if the robot has passive joints.
+def check_robot(cfg: RobotConfig, robot: Robot) -> None:
+    """Check that passive joints are observed only if the robot has some, that the lightest base that can be drawn has a
+    positive mass, and that the height scan fits in memory.
 
     Raises:
-        ConfigError: passive joints are observed, but the robot has no passive joints.
+        ConfigError: one of these is not so.
     """
-    names = ("passive_pos", "passive_vel")
-    for group, terms in ((name, group.terms) for name, group in groups_in(cfg).items()):
-        for term in terms:
-            if term in names and (robot.passive is None or not robot.passive.names):
-                where = cfg.origins.where(path_of_terms(cfg, group))
-                raise ConfigError(f"{where}: {term}: '{robot.name}' has no passive hinges or slides (passive_joints)")
-
-
-def check_base_mass(cfg: RobotConfig, robot: Robot) -> None:
-    """Check that the lightest base that can be drawn has a positive mass.
-
-    Raises:
-        ConfigError: the mass is zero or negative.
-    """
-    lowest = cfg.domain_rand.added_mass_range[0]
-    if cfg.domain_rand.randomize_base_mass and robot.base_mass + lowest <= 0.0:
-        where, mass = cfg.origins.where("domain_rand.added_mass_range"), robot.base_mass
-        raise ConfigError(
-            f"{where}: the base of '{robot.name}' weighs {mass:.4g} kg, so the lowest added mass must be above {-mass:.4g},"
-            f" got {lowest:g}"
-        )
-
-
-def check_points(cfg: RobotConfig) -> None:
-    """Check that the height scan has at most MOST_POINTS points, so that it fits in memory.
-
-    Raises:
-        ConfigError: the scan has more points.
-    """
+    for group, observed_group in groups_in(cfg).items():
+        for term in observed_group.terms:
+            if term in ("passive_pos", "passive_vel") and (robot.passive is None or not robot.passive.names):
+                text = f"{term}: '{robot.name}' has no passive hinges or slides (passive_joints)"
+                raise cfg.origins.error(path_of_terms(cfg, group), text)
+    mass, lowest = robot.base_mass, cfg.domain_rand.added_mass_range[0]
+    if cfg.domain_rand.randomize_base_mass and mass + lowest <= 0.0:
+        text = f"the base of '{robot.name}' weighs {mass:.4g} kg, so the lowest added mass must be above {-mass:.4g}"
+        raise cfg.origins.error("domain_rand.added_mass_range", f"{text}, got {lowest:g}")
     points = len(cfg.terrain.measured_points_x) * len(cfg.terrain.measured_points_y)
     if points > MOST_POINTS:
-        raise ConfigError(
-            f"{cfg.origins.where('terrain.measured_points_x')}: the height scan has {points:,} points"
-            f" (measured_points_x times measured_points_y), more than {MOST_POINTS:,}"
-        )
+        text = f"the height scan has {points:,} points (measured_points_x times measured_points_y)"
+        raise cfg.origins.error("terrain.measured_points_x", f"{text}, more than {MOST_POINTS:,}")
 
 
 def check_grid(cfg: LeggedConfig) -> None:
-    """Check that each axis of evaluation's grid of commands goes from low to high in positive steps.
+    """Check each axis of evaluation's grid of commands.
 
     Raises:
-        ConfigError: the low end of an axis is above the high end, or the step is not positive.
+        ConfigError: the low end of an axis is above the high end, the step is not positive, or the axis has too many values.
     """
     for axis in ("vx", "vy", "yaw"):
-        low, high, step = getattr(cfg.evaluation, axis)
+        low, high, step = given = getattr(cfg.evaluation, axis)
         if low > high or step <= 0.0:
-            where = cfg.origins.where(f"evaluation.{axis}")
-            raise ConfigError(f"{where}: expected [low, high, step] with low <= high and step > 0, got {[low, high, step]}")
+            text = f"expected [low, high, step] with low <= high and step > 0, got {list(given)}"
+            raise cfg.origins.error(f"evaluation.{axis}", text)
+        if (count := (high - low) / step + 1.0) > MOST_VALUES:
+            text = f"{list(given)} makes {count:,.0f} values; at most {MOST_VALUES:,} are possible"
+            raise cfg.origins.error(f"evaluation.{axis}", text)

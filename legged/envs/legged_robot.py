@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.legged import follows_velocities
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.legged import LeggedConfig, follows_velocities
+from legged.config.task import TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_grid
 from legged.envs.legged_gym_names import LeggedGymNames

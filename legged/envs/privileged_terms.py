@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig, ForceConfig, draw_of
-from legged.config.schema import RobotConfig
+from legged.config.robot import RobotConfig
 from legged.envs.marks import unit
 from legged.errors import ConfigError
 from legged.mdp.mirror_images import MirrorKind

@@ -3,14 +3,17 @@
 from collections.abc import Callable
 
 from legged.config.networks import groups_in, path_of_terms
-from legged.config.randomization import DrawConfig, ForceConfig, KickConfig, draw_of
-from legged.config.robot import has_robot
-from legged.config.schema import RobotConfig, TaskConfig
+from legged.config.randomization import DrawConfig, Range, draw_of
+from legged.config.robot import RobotConfig, has_robot
+from legged.config.task import TaskConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observed_forces
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import FIELDS
 from legged.physics.scene.robot_scene import body_names
 from legged.robots.robot import Robot
+
+Error = Callable[[str, str], ConfigError]
+"""Function: (dotted path of a setting, text) -> error about the setting, as `Origins.error` returns."""
 
 
 def check_randomization(cfg: TaskConfig) -> None:
@@ -19,81 +22,75 @@ def check_randomization(cfg: TaskConfig) -> None:
     Raises:
         ConfigError: a property does not exist, has an invalid entry, or does not fit the engine or the control law.
     """
-    rand, legged = cfg.domain_rand, has_robot(cfg)
+    rand, error = cfg.domain_rand, cfg.origins.error
     for key, ranges in (("ranges", rand.ranges), ("observed_ranges", rand.observed_ranges)):
         for name, entry in ranges.items():
-            _check_draw(name, draw_of(entry), legged, f"domain_rand.{key}.{name}", cfg.origins.where)
+            path = f"domain_rand.{key}.{name}"
+            if name not in FIELDS:
+                raise error(path, f"there is no property '{name}' to randomise{suggest(name, FIELDS, 'properties')}")
+            if not FIELDS[name].changes and not has_robot(cfg):
+                raise error(path, f"only tasks of legged robots have this property ({FIELDS[name].meaning})")
+            _check_draw(name, draw_of(entry), path, error)
     _check_derived(cfg)
-    if cfg.sim.physics == "newton" and cfg.sim.solver != "mujoco":
-        for name, entry in rand.ranges.items():
-            if draw_of(entry).when != "start":
-                where = cfg.origins.where(f"domain_rand.ranges.{name}.when")
-                raise ConfigError(f"{where}: {cfg.sim.solver} can't change properties after the start; set sim.solver=mujoco")
-    if has_robot(cfg) and cfg.control.laws == {"T"}:
-        for name in ("p_gain", "d_gain", "joint_offset"):
-            if name in rand.ranges:
-                where = cfg.origins.where(f"domain_rand.ranges.{name}")
-                raise ConfigError(
-                    f"{where}: control.control_type T takes actions as torques, and has no {FIELDS[name].meaning}"
-                )
-    actuator = cfg.control.actuator if has_robot(cfg) else None
-    if actuator is not None and actuator.network and not actuator.joints:
-        for name in ("p_gain", "d_gain"):
-            if name in rand.ranges:
-                raise ConfigError(
-                    f"{cfg.origins.where(f'domain_rand.ranges.{name}')}: all joints have a learned actuator"
-                    " (control.actuator.network), which has no gains to draw"
-                )
-    if has_robot(cfg) and "P" not in cfg.control.laws and "joint_offset" in rand.ranges:
-        where = cfg.origins.where("domain_rand.ranges.joint_offset")
-        raise ConfigError(f"{where}: control.control_type V does not read joint angles, so an offset has no effect")
+    fixed = cfg.sim.solver if cfg.sim.physics == "newton" and cfg.sim.solver != "mujoco" else ""
+    for name, entry in rand.ranges.items():
+        path = f"domain_rand.ranges.{name}"
+        if fixed and draw_of(entry).when != "start":
+            raise error(f"{path}.when", f"{fixed} can't change properties after the start; set sim.solver=mujoco")
+        if has_robot(cfg) and (why := _why_without_effect(name, cfg)):
+            raise error(path, why)
 
 
-def _check_draw(name: str, draw: DrawConfig, legged: bool, path: str, where: Callable[[str], str]) -> None:
-    """Check the entry of one property; `legged` is True for tasks of legged robots.
+def _why_without_effect(name: str, cfg: RobotConfig) -> str:
+    """Return why a property of the control law has no effect under a configuration; empty if it has one."""
+    laws, actuator = cfg.control.laws, cfg.control.actuator
+    if name in ("p_gain", "d_gain", "joint_offset") and laws == {"T"}:
+        return f"control.control_type T takes actions as torques, and has no {FIELDS[name].meaning}"
+    if name in ("p_gain", "d_gain") and actuator.network and not actuator.joints:
+        return "all joints have a learned actuator (control.actuator.network), which has no gains to draw"
+    if name == "joint_offset" and "P" not in laws:
+        return "control.control_type V does not read joint angles, so an offset has no effect"
+    return ""
+
+
+def _check_draw(name: str, draw: DrawConfig, path: str, error: Error) -> None:
+    """Check the entry of one property.
 
     Raises:
-        ConfigError: the property does not exist in this task, or its entry is invalid.
+        ConfigError: the range is beyond the property's bounds, or settings of the entry contradict each other.
     """
-    if name not in FIELDS:
-        known = suggest(name, FIELDS, "properties")
-        raise ConfigError(f"{where(path)}: there is no property '{name}' to randomise{known}")
     field, (low, high) = FIELDS[name], draw.range
     unit = "" if field.unit == "1" else f" [{field.unit}]"
-    if not field.changes and not legged:
-        raise ConfigError(f"{where(path)}: only tasks of legged robots have this property ({field.meaning})")
-    for bound, wrong, word in ((field.lowest, low, "least"), (field.highest, high, "most")):
-        if bound is not None and (wrong < bound if word == "least" else wrong > bound):
-            raise ConfigError(f"{where(path)}: must be at {word} {bound:g}{unit} ({field.meaning}), got {wrong:g}")
+    if field.lowest is not None and low < field.lowest:
+        raise error(path, f"must be at least {field.lowest:g}{unit} ({field.meaning}), got {low:g}")
+    if field.highest is not None and high > field.highest:
+        raise error(path, f"must be at most {field.highest:g}{unit} ({field.meaning}), got {high:g}")
+    _check_grow(draw.grow, path, error)
     if draw.distribution == "log_uniform" and low <= 0.0:
-        given = where(f"{path}.distribution")
-        raise ConfigError(f"{given}: log_uniform draws from ranges above 0 only, got [{low:g}, {high:g}]")
+        raise error(f"{path}.distribution", f"log_uniform draws from ranges above 0 only, got [{low:g}, {high:g}]")
     if draw.std and draw.distribution != "gaussian":
-        raise ConfigError(f"{where(f'{path}.std')}: only gaussian has a standard deviation, {draw.distribution} has none")
+        raise error(f"{path}.std", f"only gaussian has a standard deviation, {draw.distribution} has none")
     if draw.when == "interval" and not draw.interval_s:
-        raise ConfigError(f"{where(f'{path}.when')}: interval needs an interval_s above 0 [s], such as interval_s: 4.0")
+        raise error(f"{path}.when", "interval needs an interval_s above 0 [s], such as interval_s: 4.0")
     if draw.when != "interval" and draw.interval_s:
-        told = f"needs `when: interval`, got {draw.interval_s:g} with `when: {draw.when}`"
-        raise ConfigError(f"{where(f'{path}.interval_s')}: {told}")
-    _check_grow(draw, path, where)
+        text = f"needs `when: interval`, got {draw.interval_s:g} with `when: {draw.when}`"
+        raise error(f"{path}.interval_s", text)
     if draw.grow[1] and draw.when == "start":
-        raise ConfigError(f"{where(f'{path}.grow')}: the range can't widen if the property is drawn only at the start")
+        raise error(f"{path}.grow", "the range can't widen if the property is drawn only at the start")
     if draw.grow[1] and field.derived:
-        raise ConfigError(
-            f"{where(f'{path}.grow')}: the range can't widen: MuJoCo derives constants from the property, so the values of"
-            " all later draws are fixed at the start"
-        )
+        why = "MuJoCo derives constants from the property, so the values of all later draws are fixed at the start"
+        raise error(f"{path}.grow", f"the range can't widen: {why}")
 
 
-def _check_grow(of: DrawConfig | KickConfig | ForceConfig, path: str, where: Callable[[str], str]) -> None:
+def _check_grow(grow: Range, path: str, error: Error) -> None:
     """Check the iterations between which a range widens.
 
     Raises:
         ConfigError: the first and the last iteration are equal, and not 0.
     """
-    if of.grow != (0.0, 0.0) and of.grow[0] == of.grow[1]:
-        told = "expected [first, last] with first < last, or [0, 0] for a constant range"
-        raise ConfigError(f"{where(f'{path}.grow')}: {told}, got {list(of.grow)}")
+    if grow[0] == grow[1] != 0.0:
+        expected = "expected [first, last] with first < last, or [0, 0] for a constant range"
+        raise error(f"{path}.grow", f"{expected}, got {list(grow)}")
 
 
 def _check_derived(cfg: TaskConfig) -> None:
@@ -102,23 +99,21 @@ def _check_derived(cfg: TaskConfig) -> None:
     Raises:
         ConfigError: two of them are drawn at different moments.
     """
-    moments = {}
-    for name, entry in cfg.domain_rand.ranges.items():
-        if FIELDS[name].derived:
-            draw = draw_of(entry)
-            moments[name] = draw.when, draw.interval_s
+    ranges = cfg.domain_rand.ranges
+    draws = {name: draw_of(entry) for name, entry in ranges.items() if FIELDS[name].derived}
     if has_robot(cfg) and cfg.domain_rand.randomize_base_mass:
-        moments.setdefault("added_base_mass", ("start", 0.0))
-    for name, moment in moments.items():
-        first = next(iter(moments))
-        if moment != moments[first]:
-            a, b = ("at the start" if when == "start" else f"at {when}" for when, _ in (moments[first], moment))
-            path = name if name in cfg.domain_rand.ranges else first
-            names = ", ".join(moments)
-            text = f"MuJoCo derives constants from {names} together, so they must have the same `when` and interval_s"
-            if "added_base_mass" in moments and "added_base_mass" not in cfg.domain_rand.ranges:
+        draws.setdefault("added_base_mass", DrawConfig())
+    first = next(iter(draws), "")
+    for name, draw in draws.items():
+        if (draw.when, draw.interval_s) != (draws[first].when, draws[first].interval_s):
+            a, b = ("at the start" if each == "start" else f"at {each}" for each in (draws[first].when, draw.when))
+            text = (
+                f"MuJoCo derives constants from {', '.join(draws)} together, so they must have the same `when` and interval_s"
+            )
+            if "added_base_mass" in draws and "added_base_mass" not in ranges:
                 text += " (randomize_base_mass draws at the start; add added_base_mass to domain_rand.ranges instead)"
-            raise ConfigError(f"{cfg.origins.where(f'domain_rand.ranges.{path}')}: {first} is drawn {a}, {name} {b}: {text}")
+            path = f"domain_rand.ranges.{name if name in ranges else first}"
+            raise cfg.origins.error(path, f"{first} is drawn {a}, {name} {b}: {text}")
 
 
 def check_disturbances(cfg: RobotConfig, robot: Robot) -> None:
@@ -127,22 +122,21 @@ def check_disturbances(cfg: RobotConfig, robot: Robot) -> None:
     Raises:
         ConfigError: a kick or force has no effect, has an invalid `grow`, or names a body that the robot does not have.
     """
-    where = cfg.origins.where
-    for name, kick in cfg.domain_rand.kicks.items():
-        _check_grow(kick, f"domain_rand.kicks.{name}", where)
-        if all(getattr(kick, axis) == (0.0, 0.0) for axis in ("x", "y", "z", "roll", "pitch", "yaw")):
-            raise ConfigError(
-                f"{where(f'domain_rand.kicks.{name}')}: it kicks nothing; give a range for x, y, z, roll, pitch or yaw"
-            )
-    for name, force in cfg.domain_rand.forces.items():
-        path = f"domain_rand.forces.{name}"
-        _check_grow(force, path, where)
-        if all(getattr(force, axis) == (0.0, 0.0) for axis in ("x", "y", "z")):
-            raise ConfigError(f"{where(path)}: it pushes nothing; give a range for x, y or z [N]")
-        bodies = body_names(robot)
+    error, rand = cfg.origins.error, cfg.domain_rand
+    for table, axes, text in (
+        ("kicks", ("x", "y", "z", "roll", "pitch", "yaw"), "it kicks nothing; give a range for x, y, z, roll, pitch or yaw"),
+        ("forces", ("x", "y", "z"), "it pushes nothing; give a range for x, y or z [N]"),
+    ):
+        for name, entry in getattr(rand, table).items():
+            path = f"domain_rand.{table}.{name}"
+            _check_grow(entry.grow, path, error)
+            if all(getattr(entry, axis) == (0.0, 0.0) for axis in axes):
+                raise error(path, text)
+    bodies = body_names(robot) if rand.forces else ()
+    for name, force in rand.forces.items():
         if force.body and force.body not in bodies:
-            told = suggest(force.body, bodies, "bodies")
-            raise ConfigError(f"{where(f'{path}.body')}: '{robot.name}' has no body '{force.body}'{told}")
+            unknown = f"'{robot.name}' has no body '{force.body}'{suggest(force.body, bodies, 'bodies')}"
+            raise error(f"domain_rand.forces.{name}.body", unknown)
 
 
 def check_observed(cfg: TaskConfig) -> None:
@@ -153,27 +147,35 @@ def check_observed(cfg: TaskConfig) -> None:
     """
     for group, section in groups_in(cfg).items():
         for term in section.terms:
-            path = path_of_terms(cfg, group)
-            name = term.removeprefix(PREFIX)
-            if term.startswith(PREFIX) and name in FIELDS and observed(cfg, name) is None:
-                where = cfg.origins.where(path)
-                raise ConfigError(
-                    f"{where}: {term}: domain_rand.ranges does not draw '{name}', so there is nothing to observe"
-                )
-            draw = observed(cfg, name) if term.startswith(PREFIX) and name in FIELDS else None
-            if draw is not None and cfg.train.algorithm.symmetry and MIRROR_KINDS[term] in ("sideways", "joints"):
-                low, high = draw.range
-                if abs(low + high) > 1e-6 * max(abs(low), abs(high)):  # the mirrored observation could be outside [-1, 1]
-                    raise ConfigError(
-                        f"{cfg.origins.where(path)}: {term}: its range [{low:g}, {high:g}] is not symmetric about 0, so"
-                        " the term has no mirror image; set a symmetric range or train.algorithm.symmetry=false"
-                    )
-            if term == "push_force" and has_robot(cfg) and not observed_forces(cfg):
-                raise ConfigError(f"{cfg.origins.where(path)}: push_force: domain_rand.forces names no force to observe")
-            if term == "push_force" and has_robot(cfg) and cfg.train.algorithm.symmetry:
-                aside = [force.body for force in observed_forces(cfg).values() if force.body]
-                if aside:
-                    raise ConfigError(
-                        f"{cfg.origins.where(path)}: push_force: a force on '{aside[0]}' has no mirror image, because only"
-                        " forces on the base have one; remove the term or set train.algorithm.symmetry=false"
-                    )
+            name, why = term.removeprefix(PREFIX), ""
+            if term == "push_force" and has_robot(cfg):
+                why = _why_force_unobserved(cfg)
+            elif term.startswith(PREFIX) and name in FIELDS:
+                why = _why_unobserved(cfg, name)
+            if why:
+                raise cfg.origins.error(path_of_terms(cfg, group), f"{term}: {why}")
+
+
+def _why_unobserved(cfg: TaskConfig, name: str) -> str:
+    """Return why a property can't be observed; empty if it can."""
+    draw = observed(cfg, name)
+    if draw is None:
+        return f"domain_rand.ranges does not draw '{name}', so there is nothing to observe"
+    low, high = draw.range
+    changes_sign = cfg.train.algorithm.symmetry and MIRROR_KINDS[f"{PREFIX}{name}"] in ("sideways", "joints")
+    if not changes_sign or abs(low + high) <= 1e-6 * max(abs(low), abs(high)):
+        return ""
+    otherwise = "set a symmetric range or train.algorithm.symmetry=false"  # the mirrored observation could be outside [-1, 1]
+    return f"its range [{low:g}, {high:g}] is not symmetric about 0, so the term has no mirror image; {otherwise}"
+
+
+def _why_force_unobserved(cfg: RobotConfig) -> str:
+    """Return why the forces on bodies can't be observed; empty if they can."""
+    forces = observed_forces(cfg)
+    if not forces:
+        return "domain_rand.forces names no force to observe"
+    aside = next((force.body for force in forces.values() if force.body), "")
+    if not aside or not cfg.train.algorithm.symmetry:
+        return ""
+    reason = f"a force on '{aside}' has no mirror image, because only forces on the base have one"
+    return f"{reason}; remove the term or set train.algorithm.symmetry=false"

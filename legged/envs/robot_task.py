@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged.config.robot import has_robot
-from legged.config.schema import RobotConfig, TaskConfig
+from legged.config.robot import RobotConfig, has_robot
+from legged.config.task import TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
 from legged.envs.robot_terms import RobotTerms

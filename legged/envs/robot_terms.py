@@ -6,7 +6,7 @@ Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If 
 import torch
 from torch import Tensor
 
-from legged.config.schema import RobotConfig
+from legged.config.robot import RobotConfig
 from legged.envs.marks import concurrent, unit
 from legged.envs.privileged_terms import MIRROR_KINDS
 from legged.math import squared_difference

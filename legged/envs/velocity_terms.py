@@ -6,7 +6,7 @@ Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If 
 import torch
 from torch import Tensor
 
-from legged.config.schema import LeggedConfig
+from legged.config.legged import LeggedConfig
 from legged.envs.marks import concurrent, unit
 from legged.envs.robot_terms import RobotTerms
 from legged.mdp.mirror_images import MirrorKind

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, get_args
 
-from legged.config.schema import NewtonSolver
+from legged.config.world import NewtonSolver
 
 
 class Engine(NamedTuple):

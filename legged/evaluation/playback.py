@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.evaluation.velocity_grid import Grid, mean_and_worst, number_or_null
 from legged.physics import RobotScene
 from legged.policies.foreign import ForeignPolicy

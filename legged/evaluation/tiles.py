@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from legged.config import LeggedConfig
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.evaluation.velocity_grid import Grid
 from legged.terrain import TERRAIN_TYPES, Terrain, TileSpec
 

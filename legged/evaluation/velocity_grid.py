@@ -9,7 +9,7 @@ import numpy as np
 
 from legged.config import LeggedConfig
 from legged.config.legged import FASTEST
-from legged.envs.legged_checks import check_grid
+from legged.envs.legged_checks import MOST_VALUES, check_grid
 from legged.errors import ConfigError
 
 AXES = {"vx": "m/s", "vy": "m/s", "yaw": "rad/s"}
@@ -18,8 +18,6 @@ AXIS = "-1:1:0.5"
 """Default range of an axis, low:high:step."""
 MOST_ROBOTS = 2**20
 """Largest number of robots that are simulated at once."""
-MOST_VALUES = 10_000
-"""Largest number of commands on an axis."""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import TaskConfig
+from legged.config.learning import PolicyConfig
 from legged.config.networks import ESTIMATED, NETWORKS, groups_of
-from legged.config.schema import PolicyConfig
 from legged.learning.distributed import sum_over_ranks_
 from legged.learning.estimator import TARGETS
 

@@ -39,13 +39,11 @@ def resumed(
         raise ConfigError(f"--load-run: {relative(folder)} was trained on '{before.task}', not on '{task}'")
     cfg = override(before, asked)
     if has_robot(cfg) and has_robot(before) and cfg.robot != before.robot:
-        raise ConfigError(
-            f"{cfg.origins.where('robot')}: a resumed training keeps its robot '{before.robot}'; got '{cfg.robot}'"
-        )
+        raise cfg.origins.error("robot", f"a resumed training keeps its robot '{before.robot}'; got '{cfg.robot}'")
     for key in KEPT:
         old, new = (value_at(to_dict(one), key) for one in (before, cfg))
         if old != new:
-            raise ConfigError(f"{cfg.origins.where(key)}: a resumed training can't change '{old}'; got '{new}'")
+            raise cfg.origins.error(key, f"a resumed training can't change '{old}'; got '{new}'")
     task_class(cfg.task).check(cfg)
     path = find_checkpoint(folder, iteration)
     saved = read_checkpoint(path)

@@ -13,7 +13,7 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
-from legged.config.schema import RunnerConfig
+from legged.config.learning import RunnerConfig
 from legged.envs import BaseTask
 from legged.errors import ConfigError, RunError
 from legged.learning.checkpoint import (

@@ -5,7 +5,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.envs import BaseTask
-from legged.errors import ConfigError
 from legged.mdp.mirror_images import MirrorImages
 
 
@@ -17,8 +16,8 @@ def images_of(task: BaseTask) -> MirrorImages:
     """
     images = task.mirror_images()
     if images is None:
-        where = task.cfg.origins.where("train.algorithm.symmetry")
-        raise ConfigError(f"{where}: {type(task).__name__} has no mirror images, so this must be false")
+        text = f"{type(task).__name__} has no mirror images, so this must be false"
+        raise task.cfg.origins.error("train.algorithm.symmetry", text)
     return images
 
 

@@ -8,8 +8,9 @@ from typing import Any
 from torch import Tensor
 
 from legged.config import TaskConfig, follows_velocities, has_robot
+from legged.config.learning import PolicyConfig
+from legged.config.mdp import ObservationGroupConfig
 from legged.config.networks import groups_of
-from legged.config.schema import ObservationGroupConfig, PolicyConfig
 from legged.envs.privileged_terms import PREFIX as DRAWN
 from legged.envs.privileged_terms import largest_of, observed, observed_forces
 from legged.errors import ConfigError, suggest
@@ -157,8 +158,8 @@ def with_teacher(cfg: TaskConfig, teacher: Teacher) -> TaskConfig:
     groups = cfg.observations.groups
     for name, group in teacher.groups.items():
         if groups.get(name, group) != group:
-            where = cfg.origins.where(f"observations.groups.{name}")
-            raise ConfigError(f"{where}: the teacher's group has this name; rename the student's group")
+            path = f"observations.groups.{name}"
+            raise cfg.origins.error(path, "the teacher's group has this name; rename the student's group")
     # A student has no value function to warm up, and does not learn from mirror images. Without `symmetry`, the checks of the
     # task do not ask how the teacher's observations are mirrored.
     algorithm = replace(cfg.train.algorithm, symmetry=False, critic_warmup_iterations=0)

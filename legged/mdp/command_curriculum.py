@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import CommandCurriculumConfig
+from legged.config.legged import CommandCurriculumConfig
 
 if TYPE_CHECKING:
     from legged.mdp.kernels.task import TaskKernels

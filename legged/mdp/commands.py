@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import CommandsConfig
+from legged.config.legged import CommandsConfig
 from legged.math import masked_set_, wrap_to_pi, yaw_of
 from legged.mdp.random_pool import RandomPool
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.schema import RobotControlConfig
+from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuators.actuator import Actuator, check_actuator, is_ideal

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import DrawConfig
+from legged.config.randomization import DrawConfig
 from legged.mdp.random_pool import RandomPool, Slice
 
 if TYPE_CHECKING:

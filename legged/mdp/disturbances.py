@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import DrawConfig, ForceConfig, KickConfig, RobotDomainRandConfig
+from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.robot import RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool

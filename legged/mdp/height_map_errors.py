@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import HeightMapConfig
+from legged.config.robot import HeightMapConfig
 from legged.math import masked_set_
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.sensors.height_scan import HeightScan

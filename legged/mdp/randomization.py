@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig, Range, draw_of
-from legged.config.schema import RobotDomainRandConfig
+from legged.config.robot import RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool

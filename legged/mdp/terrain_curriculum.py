@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.terrain.terrain import Terrain
 
 if TYPE_CHECKING:

@@ -5,8 +5,9 @@ from typing import Any
 
 from legged.config.checks import build
 from legged.config.dotted import value_at
+from legged.config.legged import STATE_TERMS
 from legged.config.origins import Origins
-from legged.config.schema import STATE_TERMS, TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.migration import tables
@@ -102,7 +103,7 @@ def _fits(result: Translation, name: str) -> bool:
     """Return True if a terrain type fits on the fork's tiles. If not even `flat` fits, take the default tiles."""
     sizes = {path.removeprefix("terrain."): v for path, v in result.settings.items() if path.startswith("terrain.")}
     try:
-        check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, "", Origins(), ""), Origins())
+        check_terrain(build(TerrainConfig, sizes | {"proportions": {name: 1.0}}, ""), Origins())
     except ConfigError as error:
         if name != "flat":
             return False

@@ -7,9 +7,8 @@ from typing import Any
 
 from legged.config.checks import build, shown
 from legged.config.dotted import value_at
+from legged.config.legged import LeggedConfig
 from legged.config.loader import nest, to_dict
-from legged.config.origins import Origins
-from legged.config.schema import LeggedConfig
 from legged.errors import ConfigError
 from legged.migration.reading import Found
 
@@ -89,7 +88,7 @@ class Translation:
         """Set `path` to `value`, which comes from the fork's setting `theirs`. If `value` is not allowed, record a loss."""
         self.done.add(theirs)
         try:
-            build(LeggedConfig, nest(path, value), "", Origins(), "value")
+            build(LeggedConfig, nest(path, value), "value")
         except ConfigError as error:
             reason = str(error).removeprefix(f"value: {path}: ")
             self.lose(theirs, f"{path} refuses this value: {reason}") if theirs in self.theirs else None

@@ -5,9 +5,9 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from legged.config.legged import LeggedConfig
 from legged.config.loader import merge, nest
 from legged.config.origins import Origins
-from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import dump
 
 WIDTH = 120

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.base import Physics
 from legged.physics.fields import FIELDS, MODEL_FIELDS, NEWTONS_FIELDS, row_counts

@@ -8,7 +8,7 @@ import torch
 from mujoco.batch import Batch
 from torch import Tensor
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.math import quat_rotate_inverse
 from legged.physics.base import Physics
 from legged.physics.engine_warnings import keep_out_of_files

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig, Range, draw_of
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import DERIVED, FIELDS, MODEL_FIELDS, Change, changed_arrays, own_array
 from legged.physics.restitution import DampingOfBounces

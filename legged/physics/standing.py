@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics.scene import RobotScene
 from legged.robots.robot import Robot
 

@@ -14,7 +14,6 @@ import numpy as np
 from legged.config.actuator import ActuatorConfig
 from legged.config.bounds import LARGEST, between, items, positive
 from legged.config.checks import build
-from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.deploy.contract import Contract, read_contract
 from legged.deploy.policy import open_onnx, warm_up
@@ -110,7 +109,7 @@ def read_layout(name: str, where: str) -> Layout:
         data = read_yaml(path)
         if not data.get("observation"):
             raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
-        layout = build(Layout, data, "", Origins(), str(path))
+        layout = build(Layout, data, str(path))
     for term in layout.observation:
         if term not in TERMS:
             raise ConfigError(f"{path}: observation: there is no term '{term}'{suggest(term, TERMS)}")
@@ -160,7 +159,7 @@ def was_trained_with_other_motors(contract: Contract) -> bool:
     Raises:
         ConfigError: the contract's section about the actuator is invalid.
     """
-    motors = build(ActuatorConfig, contract.actuator, "", Origins(), f"{contract.path}: actuator")
+    motors = build(ActuatorConfig, contract.actuator, f"{contract.path}: actuator")
     return not is_ideal(motors) or bool(motors.armature)
 
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from legged.config import RobotConfig
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.figures import figure, import_matplotlib
 from legged.rendering.camera import Camera, frame, labels
 from legged.rendering.scene import SHOWN_DEPTH, add_painted_terrain, add_robots, add_sky

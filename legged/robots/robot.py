@@ -9,7 +9,6 @@ import numpy as np
 
 from legged.config.bounds import LARGEST, NAMES, TERMS, between, positive
 from legged.config.checks import build, shown
-from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.errors import ConfigError, suggest
 from legged.process.paths import data_folder, exists
@@ -168,7 +167,7 @@ def load_robot(name: str, where: str = "robot") -> Robot:
     missing += [k for k, other in (("stiffness", "damping"), ("damping", "stiffness")) if other in data and k not in data]
     if missing:
         raise ConfigError(f"{path}: missing: {', '.join(missing)}")
-    file = build(RobotFile, data, "", Origins(), str(path))
+    file = build(RobotFile, data, str(path))
     model = read_model(folder, file.model, str(path))
     check_model(model, file.base, str(path), file.passive_joints)
     undriven = passive_joints(model, file.passive_joints, str(path))

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 
 from legged.config import has_robot, override
+from legged.config.actuator import ActuatorConfig
 from legged.config.loader import from_dict
-from legged.config.schema import ActuatorConfig, SimConfig
+from legged.config.world import SimConfig
 from legged.deploy.contract import SCANS, Contract
 from legged.deploy.interface import Reading, RobotFacts
 from legged.errors import ConfigError, RunError

@@ -12,7 +12,6 @@ from legged.config import TaskConfig, override, to_dict
 from legged.config.bounds import FLOAT32_MAX, NAME, between, items
 from legged.config.checks import PLAIN, build, is_plain_name, shown
 from legged.config.dotted import value_at
-from legged.config.origins import Origins
 from legged.config.yaml_files import read_yaml
 from legged.envs.checks import evaluated_figures, lower_is_better
 from legged.errors import ConfigError, suggest
@@ -36,7 +35,7 @@ class ParameterConfig:
     """Greatest value."""
     log: bool = False
     """Sample uniformly on a logarithmic scale."""
-    choices: tuple[Any, ...] = field(default=(), metadata={**items(1000), "may_be_empty": True, "unique": True})
+    choices: tuple[Any, ...] = field(default=(), metadata=items(1000, {"may_be_empty": True, "unique": True}))
     """Values to try, in place of a range."""
 
 
@@ -63,7 +62,7 @@ class SweepConfig:
     """Folder under logs/; by default sweep_ followed by the name of the sweep's file."""
     trials: int = field(default=20, metadata=between(1, 1_000_000))
     """Number of trials of all processes together."""
-    seeds: tuple[int, ...] = field(default=(1,), metadata={**items(100, between(0, 2**62)), "unique": True})
+    seeds: tuple[int, ...] = field(default=(1,), metadata=items(100, {**between(0, 2**62), "unique": True}))
     """Seeds of each trial. The value of a trial is the mean over its seeds."""
     objective: ObjectiveConfig = ObjectiveConfig()
     """The objective."""
@@ -222,7 +221,7 @@ def plan_sweep(path: Path, on_cpu: bool, trials: int | None = None) -> Plan:
     """
     if find_spec("optuna") is None:
         raise ConfigError("sweep: the package optuna is not installed; run `pip install optuna`")
-    given = build(SweepConfig, read_yaml(path), "", Origins(), str(path))
+    given = build(SweepConfig, read_yaml(path), str(path))
     given = given if trials is None else replace(given, trials=trials)
     name = given.name or f"sweep_{path.stem}"
     if not is_plain_name(name):

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.errors import ConfigError
 from legged.terrain.generators import TERRAIN_TYPES, Tile, terrain_type
 from legged.terrain.height_map import HeightMap
@@ -142,74 +142,61 @@ def check_terrain(cfg: TerrainConfig, origins: Origins) -> None:
     if cfg.mesh_type == "plane":
         return
 
-    def where(field: str) -> str:
-        return origins.where(f"terrain.{field}")
+    def error(field: str, text: str) -> ConfigError:
+        return origins.error(f"terrain.{field}", text)
 
     def among(field: str) -> str:
         return f"{field} = {getattr(cfg, field)} ({origins.of(f'terrain.{field}')})"
 
     for name, share in cfg.proportions.items():
-        at = where(f"proportions.{name}")
-        terrain_type(name, at)
+        terrain_type(name, origins.where(f"terrain.proportions.{name}"))
         if share < 0.0:
-            raise ConfigError(f"{at}: must be at least 0, got {share}")
+            raise error(f"proportions.{name}", f"must be at least 0, got {share}")
     total = sum(cfg.proportions.values())
     if abs(total - 1.0) > 1e-6:
         listed = ", ".join(f"{name} {share:g}" for name, share in cfg.proportions.items())
-        raise ConfigError(f"{where('proportions')}: must sum to 1, got {total:g} ({listed})")
+        raise error("proportions", f"must sum to 1, got {total:g} ({listed})")
     for name, asked in cfg.sizes.items():
-        kind = terrain_type(name, where(f"sizes.{name}"))
+        kind = terrain_type(name, origins.where(f"terrain.sizes.{name}"))
         size = max(asked) if isinstance(asked, tuple) else asked
         if size > kind.largest:
-            raise ConfigError(f"{where(f'sizes.{name}')}: must be at most {kind.largest:g} {kind.unit}, got {size:g}")
+            raise error(f"sizes.{name}", f"must be at most {kind.largest:g} {kind.unit}, got {size:g}")
     found = column_types(cfg.proportions, cfg.num_cols)
-    for name, share in cfg.proportions.items():
-        if share > 0.0 and name not in found:
-            raise ConfigError(
-                f"{where(f'proportions.{name}')}: a share of {share:g} is less than one column"
-                f" ({among('num_cols')}); ask for more columns or leave the type out"
-            )
-        kind = TERRAIN_TYPES[name]
-        finest = kind.finest[0] * cfg.scale if kind.finest else float("inf")
-        if share > 0.0 and kind.finest is not None and cfg.horizontal_scale > finest * (1.0 + 1e-6):
-            raise ConfigError(
-                f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than the {kind.finest[1]} of"
-                f" '{name}', {finest:g} m (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
-            )
-        side = min(cfg.terrain_length, cfg.terrain_width)
-        if share > 0.0 and side <= kind.platform * cfg.scale:
-            short = "terrain_length" if cfg.terrain_length <= cfg.terrain_width else "terrain_width"
-            raise ConfigError(
-                f"{where(short)}: a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width)"
-                f" is not larger than the platform of '{name}', {kind.platform * cfg.scale:g} m"
-                f" (proportions.{name}: {origins.of(f'terrain.proportions.{name}')})"
-            )
-    if cfg.max_init_terrain_level >= cfg.num_rows:
-        raise ConfigError(
-            f"{where('max_init_terrain_level')}: must be below {among('num_rows')}, got {cfg.max_init_terrain_level}"
-        )
     side = min(cfg.terrain_length, cfg.terrain_width)
+    for name, share in cfg.proportions.items():
+        if share <= 0.0:
+            continue
+        kind, asked_by = TERRAIN_TYPES[name], f"proportions.{name}: {origins.of(f'terrain.proportions.{name}')}"
+        if name not in found:
+            few = f"a share of {share:g} is less than one column ({among('num_cols')})"
+            raise error(f"proportions.{name}", f"{few}; ask for more columns or leave the type out")
+        if kind.finest is not None and cfg.horizontal_scale > (finest := kind.finest[0] * cfg.scale) * (1.0 + 1e-6):
+            coarse = f"cells of {cfg.horizontal_scale:g} m are larger than the {kind.finest[1]} of '{name}', {finest:g} m"
+            raise error("horizontal_scale", f"{coarse} ({asked_by})")
+        if side <= (platform := kind.platform * cfg.scale):
+            tile = f"a tile of {cfg.terrain_length:g} x {cfg.terrain_width:g} m (terrain_length, terrain_width)"
+            short = "terrain_length" if side == cfg.terrain_length else "terrain_width"
+            raise error(short, f"{tile} is not larger than the platform of '{name}', {platform:g} m ({asked_by})")
+    if cfg.max_init_terrain_level >= cfg.num_rows:
+        raise error("max_init_terrain_level", f"must be below {among('num_rows')}, got {cfg.max_init_terrain_level}")
     if cfg.spawn_range >= 0.5 * side:
-        raise ConfigError(
-            f"{where('spawn_range')}: robots would start up to {cfg.spawn_range:g} m from the middle of their tile. That is"
-            f" outside the tile, whose shorter side is {side:g} m ({among('terrain_length')}, {among('terrain_width')})"
-        )
+        start = f"robots would start up to {cfg.spawn_range:g} m from the middle of their tile"
+        tile = f"the tile, whose shorter side is {side:g} m ({among('terrain_length')}, {among('terrain_width')})"
+        raise error("spawn_range", f"{start}. That is outside {tile}")
     if cfg.border_size < 2.0 * EDGE:
-        raise ConfigError(f"{where('border_size')}: must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
+        raise error("border_size", f"must be at least {2.0 * EDGE:g}, got {cfg.border_size:g}")
     square = SPAWN_SQUARE * cfg.scale
     if cfg.horizontal_scale > min(side, square):
         limit = f"a tile of {side:g} m" if side < square else f"the {square:g} m square in which robots start"
-        raise ConfigError(f"{where('horizontal_scale')}: cells of {cfg.horizontal_scale:g} m are larger than {limit}")
-    if cfg.num_rows * cfg.num_cols > MOST_TILES:
-        raise ConfigError(
-            f"{where('num_rows')}: {among('num_rows')} times {among('num_cols')} are {cfg.num_rows * cfg.num_cols:,} tiles,"
-            f" but at most {MOST_TILES:,} are allowed"
-        )
-    tiles = (cfg.num_rows * cfg.terrain_length, cfg.num_cols * cfg.terrain_width)
-    x, y = (size + 2.0 * cfg.border_size for size in tiles)
+        raise error("horizontal_scale", f"cells of {cfg.horizontal_scale:g} m are larger than {limit}")
+    if (tiles := cfg.num_rows * cfg.num_cols) > MOST_TILES:
+        product = f"{among('num_rows')} times {among('num_cols')}"
+        raise error("num_rows", f"{product} are {tiles:,} tiles, but at most {MOST_TILES:,} are allowed")
+    lengths = (cfg.num_rows * cfg.terrain_length, cfg.num_cols * cfg.terrain_width)
+    x, y = (length + 2.0 * cfg.border_size for length in lengths)
     cells = x * y / cfg.horizontal_scale**2
     if cells > MOST_CELLS:
-        raise ConfigError(
-            f"{where('horizontal_scale')}: {x:g} x {y:g} m in cells of {cfg.horizontal_scale:g} m are"
-            f" {cells:,.0f} cells, but at most {MOST_CELLS:,} are allowed; ask for larger cells or fewer tiles"
+        area = f"{x:g} x {y:g} m in cells of {cfg.horizontal_scale:g} m are {cells:,.0f} cells"
+        raise error(
+            "horizontal_scale", f"{area}, but at most {MOST_CELLS:,} are allowed; ask for larger cells or fewer tiles"
         )

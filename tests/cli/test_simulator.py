@@ -16,7 +16,8 @@ from helpers import CALM, ENGINE, HANG_S, call
 
 from legged.cli import deploy
 from legged.cli.fit_actuator import fit_actuator
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import SimConfig
 from legged.deploy.udp import UdpRobot
 from legged.errors import RunError
 from legged.physics import RobotScene

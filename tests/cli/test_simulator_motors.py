@@ -10,7 +10,9 @@ import torch
 from helpers import call, small_task
 
 from legged.cli import deploy
-from legged.config.schema import ActuatorConfig, RobotControlConfig, SimConfig
+from legged.config.actuator import ActuatorConfig
+from legged.config.robot import RobotControlConfig
+from legged.config.world import SimConfig
 from legged.deploy.contract import read_contract
 from legged.errors import ConfigError
 from legged.learning.runner import Runner

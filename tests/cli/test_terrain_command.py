@@ -7,7 +7,7 @@ from helpers import TASK, call
 from PIL import Image
 
 from legged.cli.terrain import terrain as command
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.rendering.scene import HIGH, LOW, MIDDLE, add_painted_terrain, color
 from legged.terrain import Terrain, TileSpec
 

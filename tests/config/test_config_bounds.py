@@ -298,3 +298,26 @@ def test_an_axis_of_the_command_grid_goes_from_low_to_high_in_steps(axis):
         task_config(TASK, [("evaluation.vy", axis)])
     expected = "expected [low, high, step] with low <= high and step > 0"
     assert str(error.value) == f"command line: evaluation.vy: {expected}, got {axis}"
+
+
+def test_an_axis_of_the_command_grid_has_a_limited_number_of_values():
+    with pytest.raises(ConfigError, match=r"^command line: evaluation\.yaw: .* makes 20,001 values; at most 10,000"):
+        task_config(TASK, [("evaluation.yaw", [-10.0, 10.0, 0.001])])
+
+
+def test_a_number_in_a_map_names_the_file_that_set_it(tmp_path):
+    """Beside entries of the map from other sources."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extends: {TASK}\nrewards: {{scales: {{torques: -1.0e-4, collision: -1.0e+30}}}}\n")
+    with pytest.raises(ConfigError) as error:
+        load_config(path, "mine")
+    assert str(error.value) == f"{path}: rewards.scales.collision: must be at least -1000000.0, got -1e+30"
+    with pytest.raises(ConfigError, match=r"^command line: rewards\.scales\.torques: must be at most"):
+        small_config(("rewards.scales.torques", 1e30))
+
+
+def test_the_nearest_key_may_be_one_that_only_files_have(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"extend: {TASK}\n")
+    with pytest.raises(ConfigError, match=r"mine\.yaml: extend: unknown key 'extend'; did you mean 'extends'\?"):
+        load_config(path, "mine")

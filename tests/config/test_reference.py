@@ -7,9 +7,11 @@ import pytest
 
 from legged.config import TaskConfig
 from legged.config.bounds import between, rescaled
+from legged.config.legged import LeggedConfig
 from legged.config.loader import from_dict, nest, to_dict
+from legged.config.randomization import ForceConfig, KickConfig
 from legged.config.reference import FieldText, bounds_of, fields
-from legged.config.schema import ForceConfig, KickConfig, LeggedConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.config.units import exponents, is_unit
 from legged.errors import ConfigError
 

@@ -52,6 +52,10 @@ def test_a_setting_by_both_names_is_refused(old):
         renamed(data, "mine")
 
 
+def test_a_setting_by_both_names_with_one_value_is_read():
+    assert from_dict({"observations": {"clip": 5.0, "actor_history": 2, "groups": {"actor": {"history": 2}}}})
+
+
 def test_what_is_given_is_not_changed():
     data = {"observations": {"actor": ["dof_pos"]}}
     assert renamed(data, "mine") == {"observations": {"groups": {"actor": {"terms": ["dof_pos"]}}}}

@@ -8,8 +8,9 @@ import torch
 from helpers import TASK, small_config
 
 import legged
+from legged.config.legged import LeggedConfig
 from legged.config.renamed import renamed
-from legged.config.schema import LeggedConfig, TaskConfig
+from legged.config.task import TaskConfig
 from legged.config.yaml_files import read_yaml
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.half_cheetah import HalfCheetah

@@ -7,7 +7,8 @@ import pytest
 import torch
 from helpers import CALM, ENGINE, tiny_run, zero_actions
 
-from legged.config.schema import CommandsConfig, TerrainConfig
+from legged.config.legged import CommandsConfig
+from legged.config.robot import TerrainConfig
 from legged.envs import LeggedRobot
 from legged.errors import ConfigError
 from legged.learning.display import Progress

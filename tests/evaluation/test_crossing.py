@@ -8,7 +8,7 @@ from helpers import TASK, call, kept_global_state, tiny_run
 from rich.console import Console
 
 from legged.cli.evaluate import grid
-from legged.config.schema import NewtonSolver
+from legged.config.world import NewtonSolver
 from legged.evaluation import following
 
 GRID = ["--vx=0:0.5:0.5", "--vy=0", "--yaw=0", "--robots", "1"]

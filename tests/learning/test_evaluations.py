@@ -12,7 +12,7 @@ from torch import nn
 
 from legged.cli.evaluate import grid as evaluate_grid
 from legged.cli.train import train
-from legged.config.schema import RunnerConfig
+from legged.config.learning import RunnerConfig
 from legged.evaluation.during_training import TrainingEvaluation
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.evaluations import Evaluations

@@ -11,7 +11,7 @@ from test_resume import EVENTFUL, content, same
 from legged.cli.play import play
 from legged.cli.train import train
 from legged.config import to_dict
-from legged.envs.checks import check_lengths
+from legged.envs.checks import check_sizes
 from legged.errors import ConfigError
 from legged.evaluation.learning_curves import read_scalars
 from legged.learning.run_folder import run_config
@@ -336,6 +336,6 @@ def test_a_checkpoint_file_can_be_the_teacher():
 def test_mini_batches_of_ppo_are_nothing_to_a_student():
     """Three robots and one step make fewer samples than PPO's four mini-batches want."""
     small = [("env.num_envs", 3), ("train.runner.num_steps_per_env", 1)]
-    check_lengths(task_config("anymal_c_student", [*small, ("train.distillation.gradient_length", 1)]))
+    check_sizes(task_config("anymal_c_student", [*small, ("train.distillation.gradient_length", 1)]))
     with pytest.raises(ConfigError, match="num_mini_batches: must be at most the 3 samples"):
-        check_lengths(task_config("anymal_c_proprio", small))
+        check_sizes(task_config("anymal_c_proprio", small))

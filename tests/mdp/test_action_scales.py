@@ -6,7 +6,7 @@ import pytest
 import torch
 from helpers import small_task
 
-from legged.config.schema import RobotControlConfig
+from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
 from legged.learning.runner import Runner
 from legged.mdp.control import Control

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from legged.config.schema import DrawConfig
+from legged.config.randomization import DrawConfig
 from legged.mdp.distributions import Distributions
 
 CPU = torch.device("cpu")

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from legged.config.schema import CommandCurriculumConfig, CommandRanges, CommandsConfig, RobotControlConfig
+from legged.config.legged import CommandCurriculumConfig, CommandRanges, CommandsConfig
+from legged.config.robot import RobotControlConfig
 from legged.errors import TermError
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands

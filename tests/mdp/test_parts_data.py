@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from legged.config.schema import RobotDomainRandConfig
+from legged.config.robot import RobotDomainRandConfig
 from legged.errors import TermError
 from legged.mdp.metrics import Metrics
 from legged.mdp.observations import ObservationGroup, ObservationTerms

@@ -10,7 +10,7 @@ from helpers import small_config, small_task
 
 from legged.config.actuator import ActuatorConfig
 from legged.config.robot import RobotControlConfig
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.mdp.actuators.actuator import check_actuator
 from legged.mdp.actuators.motor_curve import MotorCurve, with_rotors

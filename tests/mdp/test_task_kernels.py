@@ -7,15 +7,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from legged.config.legged import CommandCurriculumConfig, CommandsConfig
 from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
-from legged.config.robot import HeightMapConfig
-from legged.config.schema import (
-    CommandCurriculumConfig,
-    CommandsConfig,
-    RobotControlConfig,
-    RobotDomainRandConfig,
-    TerrainConfig,
-)
+from legged.config.robot import HeightMapConfig, RobotControlConfig, RobotDomainRandConfig, TerrainConfig
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts

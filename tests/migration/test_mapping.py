@@ -7,8 +7,8 @@ import pytest
 from forks import ANYMAL_FLAT, BASE, FLAT, GO2, built, line_of, sections
 
 from legged.config import from_dict
+from legged.config.legged import LeggedConfig
 from legged.config.loader import to_dict
-from legged.config.schema import LeggedConfig
 from legged.config.yaml_files import parse
 from legged.envs import LeggedRobot
 from legged.migration.mapping import map_settings

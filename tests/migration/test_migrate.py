@@ -10,7 +10,7 @@ from helpers import call
 from legged.cli.migrate import migrate
 from legged.cli.train import train
 from legged.config import from_dict
-from legged.config.schema import STATE_TERMS
+from legged.config.legged import STATE_TERMS
 from legged.config.yaml_files import read_yaml
 from legged.robots.robot import load_robot
 

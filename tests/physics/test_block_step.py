@@ -9,7 +9,7 @@ import torch
 from mechanisms import EVERY_ROW, FusedWorlds, relative_error
 from reference import heaps, snapshot
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics import MANY_WORLDS, Physics, RobotScene, make_physics
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.wide_solver import WIDE

@@ -11,7 +11,7 @@ import warp as wp
 from devices import ON_A_GPU, build, on_gpu
 from reference import heaps, random_states, roll
 
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.physics import ModelScene, RobotScene
 from legged.physics.collider.contact_pairs import contact_pair, spring_of
 from legged.physics.fused.contact_stage import ContactStage

@@ -10,7 +10,7 @@ import torch
 from devices import build, on_gpu
 from reference import CWorlds, random_states
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import MODEL_FIELDS, ModelScene, Physics, RobotScene, check_ranges
 from legged.physics.fields import changed_arrays

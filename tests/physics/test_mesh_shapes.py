@@ -5,7 +5,8 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import SimConfig
 from legged.physics import RobotScene, make_physics
 from legged.robots.robot import load_robot
 from legged.terrain import Terrain, TileSpec

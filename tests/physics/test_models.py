@@ -10,7 +10,7 @@ import pytest
 import torch
 from devices import build, engine_of, on_gpu
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import ModelScene, RobotScene, check_engine, make_physics
 from legged.physics.base import Physics

@@ -13,7 +13,8 @@ import pytest
 import torch
 from reference import TOUCHING, CWorlds, States, bits, pd, random_states, roll, snapshot, standing
 
-from legged.config.schema import NewtonSolver, SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import NewtonSolver, SimConfig
 from legged.errors import ConfigError
 from legged.physics import Physics, RobotScene, engine_name, make_physics, resolve_physics
 from legged.terrain import Terrain, TileSpec

@@ -9,7 +9,7 @@ import torch
 from devices import build, engine_of
 from reference import FIELDS, TOUCHING, CWorlds, States, heaps, pd, random_states, roll, standing
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics import RobotScene
 from legged.physics.mujoco import MujocoPhysics
 from legged.robots.robot import load_robot

@@ -9,7 +9,7 @@ import torch
 from devices import engine_of
 from reference import FIELDS, TOUCHING, CWorlds, States, assert_same, bits, heaps, random_states, roll, snapshot, standing
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import MANY_WORLDS, RobotScene, resolve_physics
 from legged.physics.mujoco import MujocoPhysics

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics import RobotScene
 from legged.physics.newton.model import build_newton_model
 from legged.physics.newton.solvers import SOLVERS

@@ -6,7 +6,7 @@ import torch
 from devices import ON_A_GPU, build, on_gpu
 from reference import roll, standing, tiles
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics import RobotScene, make_physics
 
 

@@ -6,7 +6,7 @@ import pytest
 import warp as wp
 from mechanisms import CROOKED, EVERY_JOINT, FusedWorlds, c_worlds, packaged, random_motion, relative_error
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics.fused.smooth_dynamics import SmoothDynamics, shared_bytes
 from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import launched

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.physics.scene.terrain_geoms import DEPTH, _rectangles, add_height_field, add_terrain
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec
 

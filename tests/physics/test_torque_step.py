@@ -9,7 +9,7 @@ import torch
 from mechanisms import CROOKED, EVERY_JOINT, FusedWorlds, c_worlds, packaged, random_motion, random_tree, relative_error
 from reference import CWorlds, random_states
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import make_physics as build_physics
 from legged.physics.fused.torque_step import TorqueStep

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from random_robots import EXTRAS, random_robot
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics.fused.constraint_solver import blocks, solver_constants
 from legged.physics.fused.tree import Tree
 from legged.physics.scene import RobotScene

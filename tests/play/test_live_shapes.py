@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.play.live.drawing import HALF_PLANE, PERIOD, body_meshes, plane_mesh, terrain_mesh
 from legged.terrain import Terrain, TileSpec
 

@@ -10,7 +10,7 @@ from helpers import CALM, ENGINE, call, small_config, small_task, tiny_run
 
 from legged import unit
 from legged.cli.export import export as export_tool
-from legged.config.schema import ObservationGroupConfig
+from legged.config.mdp import ObservationGroupConfig
 from legged.envs import LeggedRobot
 from legged.learning.runner import Runner
 from legged.physics import FIELDS

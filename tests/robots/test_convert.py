@@ -9,7 +9,7 @@ import torch
 from helpers import ENGINE
 from importing_fixtures import LEGS, urdf
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import RobotScene
 from legged.physics.scene.robot_scene import robot_source

@@ -8,7 +8,7 @@ import pytest
 import torch
 from helpers import small_task
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import RobotScene, make_physics
 from legged.robots.passive_joints import PassiveJoints, default_qpos

@@ -9,7 +9,8 @@ import pytest
 import torch
 from reference import TOUCHING, roll, standing
 
-from legged.config.schema import RobotControlConfig, SimConfig
+from legged.config.robot import RobotControlConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics

@@ -6,7 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged.config.schema import SimConfig, TerrainConfig
+from legged.config.robot import TerrainConfig
+from legged.config.world import SimConfig
 from legged.physics.scene import RobotScene
 from legged.physics.scene.robot_scene import robot_source
 from legged.robots.robot import Robot, load_robot

@@ -7,7 +7,8 @@ import torch
 from reference import roll
 from robot_facts import FACTS
 
-from legged.config.schema import RobotControlConfig, SimConfig
+from legged.config.robot import RobotControlConfig
+from legged.config.world import SimConfig
 from legged.mdp.control import control_gains
 from legged.physics import RobotScene, make_physics
 from legged.robots.patterns import match_values

@@ -6,7 +6,7 @@ import pytest
 import torch
 from reference import CWorlds, random_states
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import RobotScene, make_physics
 from legged.robots.robot import load_robot

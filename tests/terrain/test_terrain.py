@@ -8,7 +8,7 @@ import pytest
 
 from legged.config.loader import merge
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.errors import ConfigError
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec, check_terrain, tile_size
 from legged.terrain.height_map import CORNERS, join

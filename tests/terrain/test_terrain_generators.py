@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.terrain import TERRAIN_TYPES, HeightMap, Terrain, TileSpec
 from legged.terrain.generators import (
     Tile,

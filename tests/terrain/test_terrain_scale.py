@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from legged.config.origins import Origins
-from legged.config.schema import TerrainConfig
+from legged.config.robot import TerrainConfig
 from legged.errors import ConfigError
 from legged.evaluation.success import sizes_of
 from legged.registry import task_config

@@ -5,8 +5,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.origins import Origins
-from legged.config.schema import ActuatorConfig, RobotControlConfig
+from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
 from legged.mdp.actuators.delay import Delay
 from legged.mdp.actuators.friction import Friction, friction_numbers

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged.config.schema import ActuatorConfig
+from legged.config.actuator import ActuatorConfig
 from legged.errors import ConfigError
 from legged.mdp.actuators.model import ActuatorModel, JointStep, Motors, by_joint
 from legged.robots.robot import Robot

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.checks import PLAIN, build, is_plain_name, plain_path, shown
 from legged.config.origins import Origins
-from legged.config.schema import ActuatorConfig
 from legged.errors import ConfigError, suggest
 from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names
@@ -154,7 +154,7 @@ def registered_models(motors: Motors) -> dict[str, ActuatorModel]:
                 f"{motors.where(path)}: there is no actuator model {shown(name)}{known}; --import names the module that"
                 " registers it"
             )
-        settings: Any = build(_REGISTERED[name].Settings, given, path, motors.origins or Origins(), "control")
+        settings: Any = build(_REGISTERED[name].Settings, given, "control", motors.origins, path=path)
         made[name] = _REGISTERED[name](settings, replace(motors, path=path))  # type: ignore[call-arg]
     return made
 

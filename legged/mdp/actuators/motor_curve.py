@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged.config.actuator import ActuatorConfig
 from legged.config.origins import Origins
-from legged.config.schema import ActuatorConfig, RobotControlConfig
+from legged.config.robot import RobotControlConfig
 from legged.errors import ConfigError
 from legged.mdp.actuators.model import ActuatorModel, JointStep, Motors, by_joint, modelled_joints
 from legged.robots.robot import Robot
@@ -118,12 +119,10 @@ def check_motor_model(actuator: ActuatorConfig, origins: Origins) -> None:
     for name in ("stall_torque", "no_load_speed"):
         if actuator.model == "dc_motor" or not getattr(actuator, name):
             continue
-        where = f"control.actuator.{name}"
-        if told == "the default" or (origins.of(where) == "command line" and told != "command line"):
-            raise ConfigError(
-                f"{origins.where(where)}: only motors with a torque-speed line use it, but these motors are ideal; "
-                f"set {path} to dc_motor, or to ideal to ignore it"
-            )
+        setting = f"control.actuator.{name}"
+        if told == "the default" or (origins.of(setting) == "command line" and told != "command line"):
+            unused = "only motors with a torque-speed line use it, but these motors are ideal"
+            raise origins.error(setting, f"{unused}; set {path} to dc_motor, or to ideal to ignore it")
 
 
 def check_slowest(

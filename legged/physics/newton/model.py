@@ -6,7 +6,7 @@ from typing import Any
 import newton
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics.newton.solvers import SolverSetup
 from legged.physics.scene.robot_scene import robot_source

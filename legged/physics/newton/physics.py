@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import suggest
 from legged.physics.fields import NEWTONS_FIELDS
 from legged.physics.newton.fields import SolverFields

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from newton.solvers import SolverBase, SolverMuJoCo, SolverSteel
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics.collider.terrain_contact import TerrainContact
 from legged.physics.newton.model import build_newton_model, uses_cell_collider
 from legged.physics.newton.solvers import SOLVERS

@@ -15,7 +15,7 @@ from newton.solvers import (
     SolverXPBD,
 )
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 

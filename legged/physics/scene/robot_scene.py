@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
 from legged.robots.importing.convert import is_plain_file, robot_spec_of

@@ -6,7 +6,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 

@@ -10,7 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged.config.schema import SimConfig
+from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.contact_pairs import DEFAULT_SOLREF, is_mixed
 from legged.physics.collider.terrain_contact import TerrainContact
