@@ -86,7 +86,7 @@ def quat_from_rotation_vector(vector: Tensor) -> Tensor:
 
 
 def rotation_vector(quat: Tensor) -> Tensor:
-    """Return the axis of `quat` (..., 4), w first, times its angle in [0, pi] [rad], (..., 3)."""
+    """Return the axis of `quat` (..., 4), w first, times its angle, (..., 3). The angle is from 0 to pi [rad]."""
     quat = _w_first(quat) * torch.where(quat[..., :1] < 0.0, -1.0, 1.0)
     sine = quat[..., 1:].norm(dim=-1, keepdim=True)
     angle = 2.0 * torch.atan2(sine, quat[..., :1])
