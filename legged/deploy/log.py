@@ -118,13 +118,14 @@ def check_folder(folder: Path) -> None:
 
 
 def _write(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write an .npz file under another name, and rename it when it is complete.
+    """Write an .npz file under another name, and rename it when it is complete. A missing folder is made.
 
     Raises:
         RunError: the file cannot be written.
     """
     part = path.with_name(f".{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
         part.replace(path)
