@@ -32,9 +32,10 @@ from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.disturbances import NAMES
 from legged.evaluation.stress.measuring import RISER, TREAD, Bench, evaluate_stress
 from legged.evaluation.success import TYPES_HELP, chosen_sizes
+from legged.evaluation.trackers import Tracker, trackers_table
 from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
-from legged.policies.foreign import ForeignPolicy, read_layout, was_trained_with_other_motors
+from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
 from legged.policies.restore import policy_of
 from legged.process.paths import exists, make_folder, ready_to_write, relative, write_text
 from legged.robots.robot import Robot, load_robot
@@ -343,8 +344,8 @@ EXPORTED = ("policy.onnx", "policy.json")
         argument("--robot", help="name or folder of the robot; by default the robot that policy.json names"),
         argument(
             "--layout",
-            help="description of observation and action: a YAML file, the name holosoma, or a policy.json; by default the"
-            " policy.json next to the ONNX file",
+            help="description of observation and action: a YAML file, the name of one in this package such as holosoma, or a"
+            " policy.json; by default the policy.json next to the ONNX file",
         ),
         argument("--command", action="append", metavar="VX,VY,YAW", help="a command [m/s, m/s, rad/s]; may be repeated"),
         *(
@@ -364,6 +365,8 @@ def onnx(args: argparse.Namespace) -> int:
     model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
+    If the layout names a `task`, the files are trackers that hold their motion. The robot then tracks it to the end.
+
     With --vx, --vy or --yaw the errors over a grid of commands are measured, and policies are sorted by training time. With
     --rmse the command also prints the first policy whose velocity RMSE is at most --rmse and whose robot never falls.
     """
@@ -379,6 +382,8 @@ def onnx(args: argparse.Namespace) -> int:
     if args.out is not None:
         ready_to_write(args.out)
     layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
+    if layouts[0].task:
+        return _replay(files, layouts, args)
     contract = layouts[0].contract
     if args.robot is None and contract is None:
         raise ConfigError(f"--robot: is missing; name a robot, because the layout '{args.layout}' names none")
@@ -399,6 +404,24 @@ def onnx(args: argparse.Namespace) -> int:
     if args.out is not None:
         make_folder(args.out)
         write_text(args.out / RESULT, json.dumps(result, indent=1))
+        print(f"written: {relative(args.out / RESULT)}")
+    return 0
+
+
+def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) -> int:
+    """Let trackers track the motions in their files, print a table, and return the exit code.
+
+    Raises:
+        ConfigError: an option is given that has no effect on trackers.
+    """
+    for option in ("robot", "command", *AXES, "seconds", "rmse"):
+        if getattr(args, option) is not None:
+            raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
+    result = [Tracker(path, layout).replay() for path, layout in zip(files, layouts, strict=True)]
+    Console(width=130).print(trackers_table(result))
+    if args.out is not None:
+        make_folder(args.out)
+        write_text(args.out / RESULT, json.dumps({"trackers": result}, indent=1))
         print(f"written: {relative(args.out / RESULT)}")
     return 0
 

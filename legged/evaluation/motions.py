@@ -37,17 +37,11 @@ def evaluate_motions(setting: Setting, episodes: int) -> int:
     """
     start, cfg = time.perf_counter(), setting.cfg
     head = {**setting.head, **setting.changes}
-    exact: list[tuple[str, Any]] = [
-        ("motion.memory", 0.0),  # all bins stay equally likely
-        ("motion.pose_noise", [0.0] * 6),
-        ("motion.velocity_noise", [0.0] * 6),
-        ("motion.joint_noise", [0.0, 0.0]),
-    ]
     measured, lost = {}, 0
     for file in motion_files([Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files")):
         changes = [
             *undisturbed(setting.policy.cfg, episodes, SUCCESS_S),
-            *exact,
+            *on_the_motion(),
             *setting.asked,
             ("motion.files", [str(file)]),
         ]
@@ -62,6 +56,12 @@ def evaluate_motions(setting: Setting, episodes: int) -> int:
     print(f"written: {relative(path)}")
     warn_of_overflows("motions", lost)
     return 0
+
+
+def on_the_motion() -> list[tuple[str, Any]]:
+    """Return overrides with which episodes begin exactly on the motion, in frames that are all equally likely."""
+    nowhere = [(f"motion.{name}_noise", [0.0] * 6) for name in ("pose", "velocity")]
+    return [("motion.memory", 0.0), *nowhere, ("motion.joint_noise", [0.0, 0.0])]
 
 
 @torch.inference_mode()

@@ -4,7 +4,7 @@ A layout is a YAML file, or the policy.json of an export.
 """
 
 import ast
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,14 @@ TERMS = {
     "actions": "the policy's last output",
     "phase_sin": "sine of each clock's phase",
     "phase_cos": "cosine of each clock's phase",
+    "reference": "joint angles [rad] and velocities [rad/s] of a tracker's motion",
+    "anchor_pos": "position of the motion's anchor in the frame of the robot's anchor [m]",
+    "anchor_ori": "its orientation in this frame: two columns of the matrix, row by row",
 }
 """Terms of which an observation may consist."""
+OF_TRACKERS = ("reference", "anchor_pos", "anchor_ori")
+"""Terms that only trackers observe; `OF_WALKERS` are those that trackers do not observe."""
+OF_WALKERS = ("command_xy", "command_yaw", "phase_sin", "phase_cos")
 COMMANDS = ("command_xy", "command_yaw")
 """Terms of a layout for the two parts of the term `commands` of policy.json: its first two columns, and its third column."""
 JOINTS, STIFFNESS, DAMPING = (
@@ -85,6 +91,8 @@ class Layout:
     """Time for which an action is held [s]."""
     sim_dt: float = field(default=0.005, metadata=positive(0.1, low=1e-5))
     """Physics step [s]."""
+    task: str = ""
+    """Task with the anchor and the bodies of a tracker, which holds its motion. If empty: the policy follows commands."""
     contract: Contract | None = field(default=None, compare=False)
     """Contract of the export that the layout describes; None for a YAML file."""
 
@@ -113,6 +121,9 @@ def read_layout(name: str, where: str) -> Layout:
     for term in layout.observation:
         if term not in TERMS:
             raise ConfigError(f"{path}: observation: there is no term '{term}'{suggest(term, TERMS)}")
+        if term in (OF_WALKERS if layout.task else OF_TRACKERS):
+            why = "trackers do not observe it" if layout.task else "only trackers observe it, and their layout names a task"
+            raise ConfigError(f"{path}: observation: {term}: {why}")
     return layout
 
 
@@ -163,6 +174,24 @@ def was_trained_with_other_motors(contract: Contract) -> bool:
     return not is_ideal(motors) or bool(motors.armature)
 
 
+def listed(path: Path, metadata: Mapping[str, str], keys: Sequence[str]) -> list[Any] | None:
+    """Return the list under the first of `keys` in the `metadata` of the ONNX file at `path`; None without such a key.
+
+    Raises:
+        ConfigError: the value is no list.
+    """
+    key = next((key for key in keys if key in metadata), None)
+    if key is None:
+        return None
+    try:
+        value = ast.literal_eval(metadata[key])
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        value = [part.strip() for part in metadata[key].split(",")]
+    if not isinstance(value, list | tuple) or not value:
+        raise ConfigError(f"{path}: metadata {key}: expected a list")
+    return list(value)
+
+
 class ForeignPolicy:
     """A policy on one robot with D joints. Arguments and results have the robot's joint order; the network has its own."""
 
@@ -178,7 +207,7 @@ class ForeignPolicy:
         if layout.contract is not None:
             layout.contract.check_metadata(path, self.metadata)
         names = robot.joint_names
-        joints = list(layout.joints or self._listed(JOINTS) or names)
+        joints = list(layout.joints or listed(path, self.metadata, JOINTS) or names)
         for name in (*joints, *layout.action_joints):
             if name not in names:
                 raise ConfigError(f"{path}: robot '{robot.name}' has no joint '{name}'{suggest(str(name), names)}")
@@ -202,33 +231,19 @@ class ForeignPolicy:
         self.reset()
         self._check_sizes(robot)
 
-    def _listed(self, keys: Sequence[str]) -> list[Any] | None:
-        """Return the list under the first of `keys` in the file's metadata; None without such a key."""
-        key = next((key for key in keys if key in self.metadata), None)
-        if key is None:
-            return None
-        text = self.metadata[key]
-        try:
-            value = ast.literal_eval(text)
-        except (ValueError, SyntaxError, RecursionError, MemoryError):
-            value = [part.strip() for part in text.split(",")]
-        if not isinstance(value, list | tuple) or not value:
-            raise ConfigError(f"{self._path}: metadata {key}: expected a list")
-        return list(value)
-
     def _by_joint(self, key: str, of_robot: np.ndarray, robot: Robot, keys: Sequence[str] = ()) -> np.ndarray:
         """Return numbers (D,) in the robot's order: those of the layout, or else of the file's metadata under `keys`, or else
         `of_robot`.
         """
         if table := getattr(self.layout, key):
             return match_values(table, robot.joint_names, f"layout: {key}")
-        listed = self._listed(keys)
-        if listed is None:
+        values = listed(self._path, self.metadata, keys)
+        if values is None:
             return of_robot
-        if len(listed) != robot.num_dof or not all(isinstance(value, int | float) for value in listed):
+        if len(values) != robot.num_dof or not all(isinstance(value, int | float) for value in values):
             raise ConfigError(f"{self._path}: metadata {'/'.join(keys)}: expected {robot.num_dof} numbers")
         numbers = np.zeros(robot.num_dof)
-        numbers[self._order] = listed
+        numbers[self._order] = values
         return numbers
 
     def _check_sizes(self, robot: Robot) -> None:

@@ -1,0 +1,105 @@
+"""Replay of trackers of other projects: ONNX files with inputs `obs` and `time_step` that hold their motion."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.table import Table
+from torch import Tensor
+
+from legged.config.tracking import tracks_motions
+from legged.deploy.policy import open_onnx
+from legged.envs.motion_tracking import ERRORS, MotionTracking
+from legged.errors import ConfigError, suggest
+from legged.evaluation.motions import on_the_motion
+from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout, listed
+from legged.policies.restore import nominal, undisturbed
+from legged.registry import make_task, task_config
+from legged.tables import screen_table
+
+INPUTS = ("obs", "time_step")
+
+
+class Tracker:
+    """A tracker on the robot of a task, in C MuJoCo."""
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        """Load the ONNX file at `path`, and build the task that its layout names, with the file's motion and gains.
+
+        Raises:
+            ConfigError: the file can't be read, or does not fit the task.
+        """
+        self._path, self._session = path, open_onnx(path)
+        found = [entry.name for entry in self._session.get_inputs()]
+        if sorted(found) != sorted(INPUTS):
+            raise ConfigError(f"{path}: a tracker has the inputs {' and '.join(INPUTS)}, this file has {', '.join(found)}")
+        said = dict(self._session.get_modelmeta().custom_metadata_map)
+        names = listed(path, said, JOINTS)
+        cfg = task_config(layout.task, [("sim.physics", "mujoco")], on_cpu=True)
+        if not tracks_motions(cfg):
+            raise ConfigError(f"layout: task: '{layout.task}' tracks no motions")
+        gains = {"stiffness": listed(path, said, STIFFNESS), "damping": listed(path, said, DAMPING)}
+        changes: list[tuple[str, Any]] = [
+            *undisturbed(cfg, 1, 1e4),
+            *on_the_motion(),
+            ("motion.files", [str(path)]),
+            ("control.action_scale", layout.action_scale),
+        ]
+        if names is not None:
+            changes += [(f"control.{key}", dict(zip(names, values, strict=True))) for key, values in gains.items() if values]
+        self.task: MotionTracking = make_task(nominal(cfg, changes))
+        own = self.task.robot.joint_names
+        for name in names or ():
+            if name not in own:
+                raise ConfigError(f"{path}: '{self.task.robot.name}' has no joint '{name}'{suggest(name, own)}")
+        order = torch.tensor([own.index(name) for name in names] if names is not None else range(len(own)))
+        self._back = order.argsort()
+        self._columns = {name: order for name in ("dof_pos", "dof_vel", "actions")}
+        self._columns["reference"] = torch.cat([order, order + len(own)])
+        self._terms = layout.observation
+        width = self._observe().shape[1]
+        asked = next(entry.shape[1] for entry in self._session.get_inputs() if entry.name == "obs")
+        if isinstance(asked, int) and asked != width:
+            raise ConfigError(f"{path}: takes {asked} numbers, but the layout's observation has {width}")
+
+    def _observe(self) -> Tensor:
+        """Return the observation (1, width)."""
+        parts = []
+        for name, scale in self._terms.items():
+            values = getattr(self.task, f"_obs_{name}")()
+            parts.append(scale * (values[:, self._columns[name]] if name in self._columns else values))
+        return torch.cat(parts, dim=1)
+
+    @torch.inference_mode()
+    def replay(self) -> dict[str, Any]:
+        """Let the robot track the motion from its first frame to its last, or to a failure. Return whether it succeeded, how
+        long it lasted and should last [s], and the mean errors.
+        """
+        task = self.task
+        errors: list[Tensor] = []
+        last = len(task.motion.table.rows) - 1
+        task.start_at(torch.zeros_like(task.motion.frame))
+        failed = False
+        while len(errors) < last and not failed:
+            given = {"obs": self._observe().numpy(), "time_step": task.motion.frame.float().view(1, 1).numpy()}
+            actions = self._session.run(["actions"], given)[0]
+            if not np.isfinite(actions).all():
+                raise ConfigError(f"{self._path}: gives actions that are not finite")
+            task.step(torch.from_numpy(np.array(actions))[:, self._back])
+            errors.append(task.errors[0].clone())
+            failed = bool(task.terminated_buf[0])
+        means = torch.stack(errors).mean(dim=0).tolist()
+        times = {"success": not failed, "lasted_s": len(errors) * task.dt, "seconds": last * task.dt}
+        return {"file": str(self._path), **times, **dict(zip(ERRORS, means, strict=True))}
+
+
+def trackers_table(rows: list[dict[str, Any]]) -> Table:
+    """Return a table of the results of `Tracker.replay`."""
+    heads = ("file", "motion [s]", "whole motion", "body error [m]", "in the world [m]", "extremities [m]", "joints [rad]")
+    cells = []
+    for row in rows:
+        lasted = "tracked" if row["success"] else f"falls at {row['lasted_s']:.1f} s"
+        errors = [f"{row[key]:.3f}" for key in ("body_error", "world_error", "extremity_error", "joint_error")]
+        cells.append([Path(row["file"]).name, f"{row['seconds']:.1f}", lasted, *errors])
+    return screen_table("trackers in C MuJoCo", heads, cells)
