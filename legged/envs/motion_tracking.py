@@ -131,6 +131,10 @@ class MotionTracking(RobotTask):
         self.motion.chosen = None
         return observations
 
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        super().load_state_dict(state)
+        self.motion.read()
+
     def parts(self) -> dict[str, Any]:
         return {**super().parts(), "motion": self.motion}
 

@@ -112,4 +112,8 @@ class ReferenceMotion:
     def advance(self) -> None:
         """Go on to the next frame of each clip; the last frame is kept."""
         torch.minimum(self.frame + 1, self._last[self.frame], out=self.frame)
+        self.read()
+
+    def read(self) -> None:
+        """Look up each robot's frame."""
         torch.index_select(self.table.rows, 0, self.frame, out=self.now.rows)

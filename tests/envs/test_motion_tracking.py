@@ -207,6 +207,18 @@ def test_episodes_begin_in_chosen_frames():
     assert not torch.equal(task.motion.frame, frames + 1)
 
 
+def test_a_saved_state_goes_on_with_its_frames():
+    """A task that loads the state of another makes the same next step."""
+    first, second = (tracking(wave(), count=8) for _ in range(2))
+    actions = 0.1 * torch.randn(12, 8, 29, generator=torch.Generator().manual_seed(1))
+    for step in actions[:10]:
+        first.step(step)
+    second.load_state_dict(first.state_dict())
+    found = [task.step(actions[10])[1] for task in (first, second)]
+    assert torch.equal(*found)
+    assert torch.equal(first.motion.frame, second.motion.frame)
+
+
 def test_errors_are_those_of_a_displaced_robot():
     """0.3 m along x: only the error in the world. One knee bent by 0.1 rad: the root mean square over 29 joints."""
     task = tracking(still())
