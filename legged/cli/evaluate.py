@@ -331,6 +331,8 @@ SECONDS, HOLD_S = 8.0, Grid.hold_s
 """Default time for which a robot follows each command [s]: SECONDS in a list of commands, HOLD_S in a grid."""
 MOST_CELLS = 10_000
 """Largest number of commands of a grid. It is limited because a single robot follows all commands, one after another."""
+FRICTION = 0.8
+"""Default friction between robot and ground."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
 """Files of an exported folder: the network, and its description."""
@@ -353,7 +355,7 @@ EXPORTED = ("policy.onnx", "policy.json")
             for axis, unit in AXES.items()
         ),
         argument("--seconds", type=float, help=f"time for each command [s]; by default {SECONDS:g}, in a grid {HOLD_S:g}"),
-        argument("--friction", type=float, default=0.8, help="friction between robot and ground; 0.8 by default"),
+        argument("--friction", type=float, help=f"friction between robot and ground; {FRICTION:g} by default"),
         argument("--rmse", type=float, help="print the first policy whose mean velocity RMSE is at most this [m/s]"),
         argument("--out", type=Path, help=f"folder for {RESULT}; no file is written by default"),
     ),
@@ -375,7 +377,7 @@ def onnx(args: argparse.Namespace) -> int:
     seconds = args.seconds if args.seconds is not None else grid.hold_s if grid else SECONDS
     if not settling < seconds <= 1000.0:
         raise ConfigError(f"--seconds: must be above {settling:g} (the settling time) and at most 1000, got {seconds}")
-    if not 0.0 <= args.friction <= 10.0:
+    if args.friction is not None and not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [velocity_command(text) for text in args.command or ()] or COMMANDS
     files = [_file(name) for name in args.policy]
@@ -384,6 +386,7 @@ def onnx(args: argparse.Namespace) -> int:
     layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
     if layouts[0].task:
         return _replay(files, layouts, args)
+    args.friction = FRICTION if args.friction is None else args.friction
     contract = layouts[0].contract
     if args.robot is None and contract is None:
         raise ConfigError(f"--robot: is missing; name a robot, because the layout '{args.layout}' names none")
@@ -414,7 +417,7 @@ def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) 
     Raises:
         ConfigError: an option is given that has no effect on trackers.
     """
-    for option in ("robot", "command", *AXES, "seconds", "rmse"):
+    for option in ("robot", "command", *AXES, "seconds", "friction", "rmse"):
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
     result = [Tracker(path, layout).replay() for path, layout in zip(files, layouts, strict=True)]

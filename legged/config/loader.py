@@ -235,11 +235,10 @@ def motion_paths(section: Any, folder: Path) -> None:
     """
     motion = section.get("motion") if isinstance(section, Mapping) else None
     files = motion.get("files") if isinstance(motion, dict) else None
-    if isinstance(motion, dict) and isinstance(files, list) and all(isinstance(name, str) for name in files):
+    if isinstance(motion, dict) and isinstance(files, list | tuple) and all(name and isinstance(name, str) for name in files):
         places = (folder, Path.cwd(), data_folder("resources") / "motions")
-        for i, name in enumerate(files):
-            found = next((place / name for place in places if exists(place / name)), folder / name)
-            motion["files"][i] = str(found.absolute())
+        found = [next((place / name for place in places if exists(place / name)), folder / name) for name in files]
+        motion["files"] = [str(path.absolute()) for path in found]
 
 
 def parse_override(text: str) -> tuple[str, Any]:

@@ -33,13 +33,13 @@ class MotionConfig(Section):
     bin_s: float = field(default=1.0, metadata=quantity("s", positive(LONGEST_S, low=0.02)))
     """Length of the parts of a clip whose failures are counted [s]. Episodes begin more often in parts with failures."""
     uniform: float = field(default=0.1, metadata=positive(1e6, low=1e-6))
-    """Failures per step that all parts together count as having besides their own, so that none is left out."""
+    """Failures per step that are added to the counted ones, in equal shares for all parts. They keep every part in use."""
     memory: float = field(default=0.001, metadata=between(0, 1))
     """Share by which the counts of failures follow those of a step."""
     pose_noise: tuple[float, float, float, float, float, float] = field(
         default=(0.05, 0.05, 0.01, 0.1, 0.1, 0.2), metadata=MOTION
     )
-    """Half widths of the uniform noise on initial poses: x, y, z [m]; roll, pitch, yaw [rad], world frame."""
+    """Half widths of the uniform noise on initial poses: x, y, z [m], and a rotation vector [rad], world frame."""
     velocity_noise: tuple[float, float, float, float, float, float] = field(
         default=(0.5, 0.5, 0.2, 0.52, 0.52, 0.78), metadata=MOTION
     )

@@ -16,7 +16,15 @@ from legged.config.tracking import TrackingConfig, tracks_motions
 from legged.envs.marks import concurrent, unit
 from legged.envs.robot_task import RobotTask
 from legged.errors import ConfigError
-from legged.math import quat_angle, quat_conjugate, quat_from_rotation_vector, quat_multiply, quat_rotate, quat_to_matrix
+from legged.math import (
+    quat_angle,
+    quat_conjugate,
+    quat_from_rotation_vector,
+    quat_multiply,
+    quat_rotate,
+    quat_to_matrix,
+    yaw_of,
+)
 from legged.mdp.reference_motion import ReferenceMotion
 from legged.mdp.sensors import BodyStates, Sensor
 from legged.motion.clip import Clip
@@ -52,6 +60,8 @@ class MotionTracking(RobotTask):
         if cfg.terrain.mesh_type != "plane":
             raise ConfigError(f"{where('terrain.mesh_type')}: motions are tracked on a plane, got '{cfg.terrain.mesh_type}'")
         Skeleton(robot).indices(motion.bodies, where("motion.bodies"))
+        if not motion.extremities:
+            raise ConfigError(f"{where('motion.extremities')}: name at least one of motion.bodies")
         for path, names in (("motion.anchor", [motion.anchor]), ("motion.extremities", motion.extremities)):
             for name in names:
                 if name not in motion.bodies:
@@ -102,8 +112,7 @@ class MotionTracking(RobotTask):
         """Compare the bodies with the reference."""
         super().advance()
         anchor, now, bodies = self._anchor, self.motion.now, self.bodies
-        w, x, y, z = quat_multiply(bodies.quat[:, anchor], quat_conjugate(now.quat[:, anchor])).unbind(dim=1)
-        half = 0.5 * torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        half = 0.5 * yaw_of(quat_multiply(bodies.quat[:, anchor], quat_conjugate(now.quat[:, anchor])))
         none = torch.zeros_like(half)
         heading = torch.stack([half.cos(), none, none, half.sin()], dim=1).unsqueeze(1).expand_as(now.quat)
         start = torch.cat([bodies.pos[:, anchor, :2], now.pos[:, anchor, 2:]], dim=1).unsqueeze(1)
@@ -127,9 +136,23 @@ class MotionTracking(RobotTask):
     def start_at(self, frames: Tensor) -> TensorDict:
         """Begin an episode of each robot in `frames` (N,), rows of `motion.table`. Return the observations."""
         self.motion.chosen = frames
-        observations = self.reset()
-        self.motion.chosen = None
-        return observations
+        try:
+            return self.reset()
+        finally:
+            self.motion.chosen = None
+
+    def reset_curricula(self) -> None:
+        super().reset_curricula()
+        self.motion.failures.zero_()
+
+    def progress(self) -> dict[str, Any]:
+        return super().progress() | {"motion": {"failures": self.motion.failures.clone()}}
+
+    def load_progress(self, progress: dict[str, Any]) -> None:
+        super().load_progress(progress)
+        failures = progress.get("motion", {}).get("failures")
+        if failures is not None and failures.shape == self.motion.failures.shape:  # other motions have other parts
+            self.motion.failures.copy_(failures)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
@@ -179,14 +202,14 @@ class MotionTracking(RobotTask):
     @unit("1")
     def _reward_anchor_pos(self) -> Tensor:
         """Anchor at its place in the world: exp(-(error / 0.3 m)^2)."""
-        error = (self.motion.now.pos - self.bodies.pos)[:, self._anchor]
+        error = self.motion.now.pos[:, self._anchor] - self.bodies.pos[:, self._anchor]
         return torch.exp(-error.square().sum(dim=1) / self.ANCHOR_POS**2)
 
     @concurrent
     @unit("1")
     def _reward_anchor_ori(self) -> Tensor:
         """Anchor with its orientation in the world: exp(-(angle / 0.4 rad)^2)."""
-        angle = quat_angle(self.motion.now.quat[:, self._anchor], self.bodies.quat[:, self._anchor])
+        angle = quat_angle(*self._anchor_quats())
         return torch.exp(-angle.square() / self.ANCHOR_ANGLE**2)
 
     @concurrent
@@ -222,7 +245,7 @@ class MotionTracking(RobotTask):
     @concurrent
     def _terminate_anchor_height(self) -> Tensor:
         """Height of the anchor: the error exceeds `motion.max_anchor_height_error`."""
-        error = (self.motion.now.pos - self.bodies.pos)[:, self._anchor, 2]
+        error = self.motion.now.pos[:, self._anchor, 2] - self.bodies.pos[:, self._anchor, 2]
         return error.abs() > self.cfg.motion.max_anchor_height_error
 
     @concurrent
@@ -237,6 +260,7 @@ class MotionTracking(RobotTask):
         error = (self.target_pos - self.bodies.pos)[:, self._extremities, 2].abs()
         return (error > self.cfg.motion.max_extremity_height_error).any(dim=1)
 
+    @concurrent
     def _terminate_clip_end(self) -> Tensor:
         """End of the clip; a time-out."""
         return self.motion.ended()

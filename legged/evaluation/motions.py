@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from legged.envs.motion_tracking import ERRORS, MotionTracking
+from legged.errors import ConfigError
 from legged.evaluation.intervals import wilson
 from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
 from legged.evaluation.result_file import write_result
@@ -22,25 +23,34 @@ SUCCESS_S = 10.0
 """An episode succeeds if no failure ends it within this time [s]. At the end of its motion, a robot begins anew."""
 
 
+ENDLESS_S = 1e4
+"""Length of episodes that no motion reaches, so that only failures and the ends of motions end them [s]."""
+
+
 def motions_name(physics: str) -> str:
     """Return the name of the file with the result in an engine."""
     return f"motions_{physics}.json"
 
 
 def evaluate_motions(setting: Setting, episodes: int) -> int:
-    """Measure each motion of a task: `episodes` robots begin in frames drawn uniformly, and one robot in the first frame.
+    """Measure each motion of a task: `episodes` robots begin in frames drawn uniformly, then in the first frame.
     Nothing is random besides these frames. Print a table, write motions_<physics>.json, and return the exit code.
 
     Raises:
-        ConfigError: a motion can't be read.
+        ConfigError: a motion can't be read, or two have one name.
         RunError: the file can't be written.
     """
     start, cfg = time.perf_counter(), setting.cfg
     head = {**setting.head, **setting.changes}
     measured, lost = {}, 0
-    for file in motion_files([Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files")):
+    files, where = [Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files")
+    files = motion_files(files, where)
+    for name in {file.stem for file in files}:
+        if sum(file.stem == name for file in files) > 1:
+            raise ConfigError(f"{where}: two motions are named '{name}'; evaluate them one after the other")
+    for file in files:
         changes = [
-            *undisturbed(setting.policy.cfg, episodes, SUCCESS_S),
+            *undisturbed(setting.policy.cfg, episodes, ENDLESS_S),
             *on_the_motion(),
             *setting.asked,
             ("motion.files", [str(file)]),
@@ -67,6 +77,7 @@ def on_the_motion() -> list[tuple[str, Any]]:
 @torch.inference_mode()
 def _from_anywhere(task: MotionTracking, act: Policy, overflows: Overflows) -> dict[str, Any]:
     """Return success and mean errors of robots that begin in random frames, and success by the second of the beginning."""
+    task.reset_curricula()
     observations = task.reset()
     begun = task.motion.drawn.clone()
     running = torch.ones_like(task.reset_buf)
@@ -74,15 +85,16 @@ def _from_anywhere(task: MotionTracking, act: Policy, overflows: Overflows) -> d
     for _ in range(round(SUCCESS_S / task.dt)):
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
-        errors += torch.where(running.unsqueeze(1), task.errors, 0.0)
-        steps += running
+        seen = running & task.valid
+        errors += torch.where(seen.unsqueeze(1), task.errors, 0.0)
+        steps += seen
         running &= ~task.terminated_buf
     count, successes = task.num_envs, int(running.sum())
     low, high = wilson(successes, count)
-    means = (errors / steps.unsqueeze(1)).mean(dim=0).tolist()
+    means = (errors / steps.clamp(min=1.0).unsqueeze(1)).mean(dim=0).tolist()
     seconds = (begun * task.dt).long()
     return {
-        "seconds": len(task.motion.table.rows) * task.dt,
+        "seconds": (len(task.motion.table.rows) - 1) * task.dt,
         "episodes": count,
         "successes": successes,
         "share": successes / count,

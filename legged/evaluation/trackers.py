@@ -12,13 +12,14 @@ from legged.config.tracking import tracks_motions
 from legged.deploy.policy import open_onnx
 from legged.envs.motion_tracking import ERRORS, MotionTracking
 from legged.errors import ConfigError, suggest
-from legged.evaluation.motions import on_the_motion
+from legged.evaluation.motions import ENDLESS_S, on_the_motion
 from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout, listed
 from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task, task_config
+from legged.robots.robot import load_robot
 from legged.tables import screen_table
 
-INPUTS = ("obs", "time_step")
+INPUTS, ACTIONS = ("obs", "time_step"), "actions"
 
 
 class Tracker:
@@ -34,6 +35,8 @@ class Tracker:
         found = [entry.name for entry in self._session.get_inputs()]
         if sorted(found) != sorted(INPUTS):
             raise ConfigError(f"{path}: a tracker has the inputs {' and '.join(INPUTS)}, this file has {', '.join(found)}")
+        if ACTIONS not in [entry.name for entry in self._session.get_outputs()]:
+            raise ConfigError(f"{path}: has no output '{ACTIONS}'")
         said = dict(self._session.get_modelmeta().custom_metadata_map)
         names = listed(path, said, JOINTS)
         cfg = task_config(layout.task, [("sim.physics", "mujoco")], on_cpu=True)
@@ -41,18 +44,24 @@ class Tracker:
             raise ConfigError(f"layout: task: '{layout.task}' tracks no motions")
         gains = {"stiffness": listed(path, said, STIFFNESS), "damping": listed(path, said, DAMPING)}
         changes: list[tuple[str, Any]] = [
-            *undisturbed(cfg, 1, 1e4),
+            *undisturbed(cfg, 1, ENDLESS_S),
             *on_the_motion(),
             ("motion.files", [str(path)]),
             ("control.action_scale", layout.action_scale),
         ]
-        if names is not None:
-            changes += [(f"control.{key}", dict(zip(names, values, strict=True))) for key, values in gains.items() if values]
-        self.task: MotionTracking = make_task(nominal(cfg, changes))
-        own = self.task.robot.joint_names
+        own = load_robot(cfg.robot).joint_names
         for name in names or ():
             if name not in own:
-                raise ConfigError(f"{path}: '{self.task.robot.name}' has no joint '{name}'{suggest(name, own)}")
+                raise ConfigError(f"{path}: '{cfg.robot}' has no joint '{name}'{suggest(name, own)}")
+        if (names is not None and len(names) != len(set(names))) or len(names or own) != len(own):
+            raise ConfigError(f"{path}: names {len(set(names or ()))} joints, but '{cfg.robot}' has {len(own)}")
+        for key, values in gains.items():
+            if values is None:
+                continue
+            if len(values) != len(own) or not all(isinstance(value, int | float) for value in values):
+                raise ConfigError(f"{path}: metadata of the {key}: expected {len(own)} numbers")
+            changes.append((f"control.{key}", dict(zip(names or own, values, strict=True))))
+        self.task: MotionTracking = make_task(nominal(cfg, changes))
         order = torch.tensor([own.index(name) for name in names] if names is not None else range(len(own)))
         self._back = order.argsort()
         self._columns = {name: order for name in ("dof_pos", "dof_vel", "actions")}
@@ -83,9 +92,9 @@ class Tracker:
         failed = False
         while len(errors) < last and not failed:
             given = {"obs": self._observe().numpy(), "time_step": task.motion.frame.float().view(1, 1).numpy()}
-            actions = self._session.run(["actions"], given)[0]
-            if not np.isfinite(actions).all():
-                raise ConfigError(f"{self._path}: gives actions that are not finite")
+            actions = self._session.run([ACTIONS], given)[0]
+            if actions.shape != (1, len(self._back)) or not np.isfinite(actions).all():
+                raise ConfigError(f"{self._path}: expected {len(self._back)} finite actions, got {actions.shape}")
             task.step(torch.from_numpy(np.array(actions))[:, self._back])
             errors.append(task.errors[0].clone())
             failed = bool(task.terminated_buf[0])

@@ -72,7 +72,7 @@ class ReferenceMotion:
         self.frame = torch.zeros(n, dtype=torch.long, device=device)
         """(N,) row of the frame that each robot should have reached at the end of the present control step."""
         self.failures = torch.zeros(len(self._starts), device=device)
-        """(K,) failures per step in each bin, averaged over time."""
+        """(K,) failures of all robots per step in each bin, averaged over time. Each of several processes counts its own."""
         self.drawn = torch.zeros_like(self.frame)
         """(N,) rows in which the next episodes begin."""
         width = self.table.rows.shape[1]

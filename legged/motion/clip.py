@@ -52,10 +52,15 @@ class Clip:
     def resampled(self, fps: float) -> "Clip":
         """Return the clip at another rate. Positions are interpolated linearly, orientations on the shortest arc. The frames
         are at k / `fps`, before the end of the clip.
+
+        Raises:
+            ConfigError: too few frames are left.
         """
         if fps == self.fps:
             return self
         count = int(np.ceil(self.seconds * fps - 1e-9))
+        if count < FEWEST:
+            raise ConfigError(f"{self.name}: has {count} frames at {fps:g} frames per second; it needs at least {FEWEST}")
         places = np.arange(count) * (self.fps / fps)
         first = np.minimum(places.astype(int), len(self) - 2)
         share = (places - first)[:, None]
@@ -82,13 +87,15 @@ def make_clip(name: str, fps: float, root_pos: np.ndarray, root_quat: np.ndarray
     """Return a clip of arrays of any number type. Quaternions are normalised. Error messages begin with `where`.
 
     Raises:
-        ConfigError: the clip is too short, its rate is not positive, or a number is NaN or infinite.
+        ConfigError: the clip is too short, its arrays differ in length, its rate is not positive, or a number is not finite.
     """
     pos, quat, joint = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
     if not 0.0 < fps < np.inf:
         raise ConfigError(f"{where}: the rate must be positive, got {fps:g} frames per second")
     if len(joint) < FEWEST:
         raise ConfigError(f"{where}: the clip has {len(joint)} frames; it needs at least {FEWEST}")
+    if not len(pos) == len(quat) == len(joint):
+        raise ConfigError(f"{where}: has {len(pos)} root positions, {len(quat)} orientations and {len(joint)} rows of joints")
     for what, values in (("root position", pos), ("root orientation", quat), ("joint angle", joint)):
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if len(bad):

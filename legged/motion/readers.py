@@ -2,23 +2,25 @@
 trackers that hold their motion.
 """
 
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from legged.errors import ConfigError, suggest
 from legged.motion.clip import Clip, make_clip
 from legged.motion.kinematics import Skeleton
-from legged.process.paths import relative
+from legged.process.paths import exists, relative
 
 ROOT = 7
 """Columns of the root: position and quaternion."""
 READERS = (".csv", ".npz", ".onnx")
 """Endings of the files that can be read."""
-CSV_FPS = 30.0
-"""Frames per second of a csv file, which does not say."""
+CSV_FPS, ONNX_FPS = 30.0, 50.0
+"""Frames per second of csv and ONNX files, which do not say. Those of csv files may be given."""
 
 
 def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
@@ -35,7 +37,7 @@ def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
         if path.suffix == ".csv":
             return _read_csv(path, skeleton, where, csv_fps)
         return _read_npz(path, skeleton, where) if path.suffix == ".npz" else _read_onnx(path, skeleton, where)
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, TypeError, IndexError, EOFError, BadZipFile, zlib.error) as error:
         raise ConfigError(f"{where}: can't be read as a motion ({error})") from error
 
 
@@ -47,15 +49,16 @@ def motion_files(paths: Sequence[Path], where: str) -> list[Path]:
     """
     files: list[Path] = []
     for path in paths:
-        found = sorted(file for file in path.rglob("*") if file.suffix in READERS) if path.is_dir() else [path]
-        if not found or not found[0].is_file():
+        is_folder = exists(path) and path.is_dir()
+        found = sorted(file for file in path.rglob("*") if file.suffix in READERS) if is_folder else [path]
+        if not found or not exists(found[0]):
             raise ConfigError(
                 f"{where}: {relative(path)} is no file of a motion, and no folder with one ({', '.join(READERS)})"
             )
         files += found
     if not files:
         raise ConfigError(f"{where}: name at least one file of a motion ({', '.join(READERS)})")
-    return files
+    return list(dict.fromkeys(files))
 
 
 def _read_csv(path: Path, skeleton: Skeleton, where: str, fps: float) -> Clip:
@@ -69,6 +72,8 @@ def _read_npz(path: Path, skeleton: Skeleton, where: str) -> Clip:
         arrays = dict(file)
     if "joint_pos" not in arrays:
         raise ConfigError(f"{where}: has no array 'joint_pos'{suggest('joint_pos', arrays, 'arrays')}")
+    if "fps" not in arrays:
+        raise ConfigError(f"{where}: has no array 'fps', the frames per second{suggest('fps', arrays, 'arrays')}")
     rows, names = arrays["joint_pos"], _texts(arrays.get("joint_names"))
     count = len(skeleton.robot.joint_names) if names is None else len(names)
     fps = float(np.ravel(arrays["fps"])[0])
@@ -99,7 +104,7 @@ def _read_onnx(path: Path, skeleton: Skeleton, where: str) -> Clip:
         pos, quat = skeleton.root_poses("torso_link", arrays["ref_pos_xyz"].astype(np.float64), quat, joint)
     else:
         pos, quat = _base_of(arrays, _list(said.get("body_names")), skeleton, where)
-    return make_clip(path.stem, 50.0, pos, quat, joint, where)
+    return make_clip(path.stem, ONNX_FPS, pos, quat, joint, where)
 
 
 def _tables(graph: Any) -> dict[str, np.ndarray]:
@@ -149,6 +154,7 @@ def _ordered(joint: np.ndarray, names: Sequence[str] | None, skeleton: Skeleton,
     if names is None:
         _check_width(joint, len(own), where)
         return joint
+    _check_width(joint, len(names), where)
     for name in own:
         if name not in names:
             raise ConfigError(f"{where}: has no joint '{name}' of {skeleton.robot.name}{suggest(name, names, 'joints')}")

@@ -20,8 +20,12 @@ pytestmark = pytest.mark.usefixtures("workplace")
 TERMS = dict.fromkeys(("actions", "base_ang_vel", "dof_pos", "dof_vel", "reference", "anchor_ori"), 1.0)
 
 
-def tracker_file(gain: float = 0.0, reverse: bool = False, inputs: tuple[str, ...] = ("obs", "time_step")) -> Path:
-    """An ONNX file of a G1 that holds the squat. Its actions are `gain` times the reference's angles in the observation."""
+def tracker_file(
+    gain: float = 0.0, others: float = 0.0, reverse: bool = False, inputs: tuple[str, ...] = ("obs", "time_step")
+) -> Path:
+    """An ONNX file of a G1 that holds the squat. Its actions are `gain` times the reference's angles, and `others` times the
+    last actions, the angles and the velocities of the robot.
+    """
     robot = load_robot("g1")
     with np.load(data_folder("resources") / "motions" / "g1" / "squat.npz") as file:
         rows = file["joint_pos"]
@@ -32,6 +36,8 @@ def tracker_file(gain: float = 0.0, reverse: bool = False, inputs: tuple[str, ..
     nodes += [helper.make_node("Gather", [f"{name}_table", "step"], [name]) for name in tables]
     weights = np.zeros((154, 29), dtype=np.float32)
     weights[90:119] = gain * np.eye(29)  # after 29 actions, 3 angular velocities, 29 angles and 29 velocities
+    for start in (0, 32, 61):
+        weights[start : start + 29] = others * np.eye(29)
     nodes += [helper.make_node("MatMul", ["obs", "weights"], ["actions"])]
     constants = [numpy_helper.from_array(values.astype(np.float32), f"{name}_table") for name, values in tables.items()]
     constants += [numpy_helper.from_array(weights, "weights")]
@@ -63,7 +69,7 @@ def test_the_robot_holds_the_pose_of_the_network_until_it_fails():
 
 
 def test_the_network_sees_the_reference_of_the_step_and_moves_the_joints():
-    """An action of the reference's angles less the default ones makes targets that are the reference's."""
+    """Actions that are the reference's angles: those of the frame to reach in this step."""
     tracker = Tracker(tracker_file(gain=1.0), layout())
     task, targets = tracker.task, []
     step = task.step
@@ -81,7 +87,7 @@ def test_the_network_sees_the_reference_of_the_step_and_moves_the_joints():
 
 def test_joints_may_have_another_order():
     """The same network with its joints in reverse: the robot does the same."""
-    found = [Tracker(tracker_file(gain=0.2, reverse=reverse), layout()).replay() for reverse in (False, True)]
+    found = [Tracker(tracker_file(0.2, 0.01, reverse=reverse), layout()).replay() for reverse in (False, True)]
     assert found[0].pop("file") == found[1].pop("file")
     assert found[0] == pytest.approx(found[1], rel=1e-3, abs=1e-4)
 

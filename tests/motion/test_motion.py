@@ -245,6 +245,18 @@ def test_a_wrong_file_is_named(skeleton, content, message):
     assert message in str(caught.value)
 
 
+def test_arrays_of_different_lengths_are_named(skeleton):
+    arrays = {"joint_pos": np.zeros((9, 29)), "body_pos_w": np.zeros((5, 1, 3)), "body_quat_w": np.ones((5, 1, 4))}
+    np.savez("clip.npz", fps=50.0, **arrays)
+    with pytest.raises(ConfigError, match="has 5 root positions, 5 orientations and 9 rows of joints"):
+        read_clip(Path("clip.npz"), skeleton)
+
+
+def test_a_rate_that_leaves_too_few_frames_is_named(robot):
+    with pytest.raises(ConfigError, match="wave: has 2 frames at 1 frames per second; it needs at least 3"):
+        wave(robot).resampled(1.0)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -252,6 +264,7 @@ def test_a_wrong_file_is_named(skeleton, content, message):
         ("clip.csv", b"x,y\n", "clip.csv: can't be read as a motion"),
         ("clip.npz", b"nothing", "clip.npz: can't be read as a motion"),
         ("clip.onnx", b"nothing", "clip.onnx: onnx can't read it"),
+        ("clip.npz", b"PK\x03\x04" + bytes(40), "clip.npz: can't be read as a motion"),
         ("clip.bvh", b"", "clip.bvh: motions are read from .csv, .npz, .onnx"),
     ],
 )
