@@ -25,7 +25,7 @@ def name_of(path: Path) -> str:
 
 @functools.cache
 def imports(path: Path) -> set[str]:
-    """What a file imports anywhere in it, functions and annotations included, as dotted names: `a.b` of `from a import b`."""
+    """A file's imports anywhere in it, functions and annotations included, as dotted names: `a.b` of `from a import b`."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):

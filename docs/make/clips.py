@@ -21,7 +21,7 @@ from legged.motion.checks import quality_of
 from legged.motion.clip import Clip, make_clip, write_clip
 from legged.motion.kinematics import Skeleton
 from legged.policies.restore import policy_of
-from legged.process.paths import relative
+from legged.process.paths import data_folder, relative
 from legged.robots.robot import load_robot
 
 FPS = 50.0
@@ -81,7 +81,7 @@ def _main(argv: list[str] | None) -> int:
 
 def recorded(name: str, command: tuple[float, float, float]) -> Clip:
     """Return a clip of the policy `g1_flat` that follows a velocity command [m/s, m/s, rad/s]."""
-    policy = policy_of("g1_flat", None)
+    policy = policy_of(str(data_folder("resources") / "policies" / "g1_flat"), None)
     changes = (("env.episode_length_s", SETTLE_S + RECORDED_S + 0.1), ("sim.physics", "mujoco"))
     episodes, _ = roll_out(policy, Wish(1, 1, command=command, changes=changes), torch.device("cpu"))
     robot = load_robot("g1")

@@ -156,8 +156,7 @@ def _merged(
         for section in (data, data.get("cpu", {})):
             if "robot" in section:
                 section["robot"] = robot_path(section["robot"], layer.folder)
-            actuator_path(section, layer.folder)
-            motion_paths(section, layer.folder)
+            file_paths(section, layer.folder)
         parts.append((layer, data))
     if robot is None:
         asked = [data.get("cpu", {}).get("robot") for _, data in parts if on_cpu], [data.get("robot") for _, data in parts]
@@ -218,22 +217,16 @@ def robot_path(robot: Any, folder: Path) -> Any:
     return str((folder / robot).absolute()) if robot.startswith(".") or "/" in robot else robot
 
 
-def actuator_path(section: Any, folder: Path) -> None:
-    """Make the path of a learned actuator in `section` absolute. The path is relative to `folder`, the folder of the
-    configuration file. If no such file exists there, the path is relative to the working directory.
+def file_paths(section: Any, folder: Path) -> None:
+    """Make the paths of a learned actuator and of reference motions in `section` absolute. A path is relative to `folder`,
+    the folder of the configuration file. If no such file exists there, the path is relative to the working directory, or for
+    a motion to resources/motions.
     """
-    for key in ("control", "actuator"):
-        section = section.get(key) if isinstance(section, Mapping) else None
-    name = section.get("network") if isinstance(section, dict) else None
-    if isinstance(name, str) and name:
-        section["network"] = str((folder / name if exists(folder / name) else Path.cwd() / name).absolute())
-
-
-def motion_paths(section: Any, folder: Path) -> None:
-    """Make the paths of reference motions in `section` absolute, as `actuator_path` does. A path that exists in neither
-    folder is looked for in resources/motions.
-    """
-    motion = section.get("motion") if isinstance(section, Mapping) else None
+    control, motion = (section.get(key) if isinstance(section, Mapping) else None for key in ("control", "motion"))
+    actuator = control.get("actuator") if isinstance(control, Mapping) else None
+    name = actuator.get("network") if isinstance(actuator, dict) else None
+    if isinstance(actuator, dict) and isinstance(name, str) and name:
+        actuator["network"] = str((folder / name if exists(folder / name) else Path.cwd() / name).absolute())
     files = motion.get("files") if isinstance(motion, dict) else None
     if isinstance(motion, dict) and isinstance(files, list | tuple) and all(name and isinstance(name, str) for name in files):
         places = (folder, Path.cwd(), data_folder("resources") / "motions")
@@ -300,8 +293,7 @@ def _merge_overrides(
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
         layer = renamed(layer, "command line")
         build(schema, layer, "command line")
-        actuator_path(layer, Path.cwd())
-        motion_paths(layer, Path.cwd())
+        file_paths(layer, Path.cwd())
         merge(data, layer, "command line", origins)
 
 

@@ -1,8 +1,11 @@
 """An exported policy for one robot: readings and commands -> observations -> policy.onnx -> joint targets."""
 
+import ast
 import threading
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -48,6 +51,24 @@ def _limit_memory() -> None:
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
     memory = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
     onnxruntime.create_and_register_allocator(memory, onnxruntime.OrtArenaCfg({"max_mem": MOST_BYTES}))
+
+
+def listed(path: Path, metadata: Mapping[str, str], keys: Sequence[str]) -> list[Any] | None:
+    """Return the list under the first of `keys` in the `metadata` of the ONNX file at `path`; None without such a key.
+
+    Raises:
+        ConfigError: the value is no list.
+    """
+    key = next((key for key in keys if key in metadata), None)
+    if key is None:
+        return None
+    try:
+        value = ast.literal_eval(metadata[key])
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        value = [part.strip() for part in metadata[key].split(",")]
+    if not isinstance(value, list | tuple) or not value:
+        raise ConfigError(f"{path}: metadata {key}: expected a list")
+    return list(value)
 
 
 def warm_up(path: Path, session: onnxruntime.InferenceSession, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:

@@ -59,14 +59,15 @@ class MotionTracking(RobotTask):
             raise ConfigError(f"{where('robot')}: '{robot.name}' has joints without a motor, which no reference moves")
         if cfg.terrain.mesh_type != "plane":
             raise ConfigError(f"{where('terrain.mesh_type')}: motions are tracked on a plane, got '{cfg.terrain.mesh_type}'")
-        Skeleton(robot).indices(motion.bodies, where("motion.bodies"))
+        skeleton = Skeleton(robot)
+        skeleton.indices(motion.bodies, where("motion.bodies"))
         if not motion.extremities:
             raise ConfigError(f"{where('motion.extremities')}: name at least one of motion.bodies")
         for path, names in (("motion.anchor", [motion.anchor]), ("motion.extremities", motion.extremities)):
             for name in names:
                 if name not in motion.bodies:
                     raise ConfigError(f"{where(path)}: '{name}' must be one of motion.bodies: {', '.join(motion.bodies)}")
-        _clips(cfg)
+        _clips(cfg, skeleton)
 
     # ---- construction ------------------------------------------------------------------------------------------------
 
@@ -79,7 +80,8 @@ class MotionTracking(RobotTask):
         """Load the motions, and reserve the random numbers of initial states."""
         motion, device = self.cfg.motion, self.device
         settings = (motion.bin_s, motion.uniform, motion.memory)
-        self.motion = ReferenceMotion(_clips(self.cfg), Skeleton(self.robot), motion.bodies, self.numbers, *settings)
+        skeleton = Skeleton(self.robot)
+        self.motion = ReferenceMotion(_clips(self.cfg, skeleton), skeleton, motion.bodies, self.numbers, *settings)
         self._anchor = motion.bodies.index(motion.anchor)
         self._extremities = torch.tensor([motion.bodies.index(name) for name in motion.extremities], device=device)
         pose, velocity = (torch.tensor(noise, device=device) for noise in (motion.pose_noise, motion.velocity_noise))
@@ -287,8 +289,8 @@ class MotionTracking(RobotTask):
         return self.motion.now.quat[:, self._anchor], self.bodies.quat[:, self._anchor]
 
 
-def _clips(cfg: TrackingConfig) -> list[Clip]:
+def _clips(cfg: TrackingConfig, skeleton: Skeleton) -> list[Clip]:
     """Return the clips of a task, at its control rate."""
-    motion, skeleton = cfg.motion, Skeleton(load_robot(cfg.robot))
+    motion = cfg.motion
     files = motion_files([Path(name) for name in motion.files], cfg.origins.where("motion.files"))
     return [read_clip(file, skeleton, motion.csv_fps).resampled(round(1.0 / cfg.dt, 6)) for file in files]

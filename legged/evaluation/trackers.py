@@ -9,11 +9,11 @@ from rich.table import Table
 from torch import Tensor
 
 from legged.config.tracking import tracks_motions
-from legged.deploy.policy import open_onnx
+from legged.deploy.policy import listed, open_onnx
 from legged.envs.motion_tracking import ERRORS, MotionTracking
 from legged.errors import ConfigError, suggest
 from legged.evaluation.motions import ENDLESS_S, on_the_motion
-from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout, listed
+from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout
 from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot

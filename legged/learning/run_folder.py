@@ -14,7 +14,7 @@ from pathlib import Path
 from legged.config import TaskConfig, from_dict, has_robot, to_yaml
 from legged.config.actuator import MOTORS
 from legged.config.checks import shown
-from legged.config.loader import actuator_path, motion_paths, read_yaml
+from legged.config.loader import file_paths, read_yaml
 from legged.errors import ConfigError, suggest
 from legged.learning.invocation import INVOCATION_FILE
 from legged.process.paths import data_folder, exists, listed, make_folder, not_made, relative, write_bytes, write_text
@@ -284,8 +284,7 @@ def run_config(folder: Path, where: str = "POLICY") -> TaskConfig:
     if not path.is_file():
         raise ConfigError(f"{where}: {relative(folder)} is not a run folder (it has no {CONFIG_FILE}){_remedy(folder)}")
     data = read_yaml(path)
-    actuator_path(data, folder)
-    motion_paths(data, folder)
+    file_paths(data, folder)
     return from_dict(data, source=str(path), schema=task_schema(str(data.get("task", ""))))
 
 

@@ -87,7 +87,9 @@ def _read_npz(path: Path, skeleton: Skeleton, where: str) -> Clip:
 
 
 def _read_onnx(path: Path, skeleton: Skeleton, where: str) -> Clip:
-    import onnx  # only needed here, and slow to import
+    import onnx  # only needed here, and slow to import, as onnxruntime is
+
+    from legged.deploy.policy import listed
 
     try:
         graph = onnx.load(str(path))
@@ -97,13 +99,13 @@ def _read_onnx(path: Path, skeleton: Skeleton, where: str) -> Clip:
     if "joint_pos" not in arrays:
         raise ConfigError(f"{where}: the model has no output 'joint_pos' that is looked up by time step; it holds no motion")
     said = {entry.key: entry.value for entry in graph.metadata_props}
-    names = _list(said.get("joint_names") or said.get("dof_names"))
+    names = listed(path, said, ("joint_names", "dof_names"))
     joint = _ordered(arrays["joint_pos"], names, skeleton, where)
     if "ref_pos_xyz" in arrays:  # holosoma: the pose of the torso
         quat = arrays["ref_quat_xyzw"][:, [3, 0, 1, 2]].astype(np.float64)
         pos, quat = skeleton.root_poses("torso_link", arrays["ref_pos_xyz"].astype(np.float64), quat, joint)
     else:
-        pos, quat = _base_of(arrays, _list(said.get("body_names")), skeleton, where)
+        pos, quat = _base_of(arrays, listed(path, said, ("body_names",)), skeleton, where)
     return make_clip(path.stem, ONNX_FPS, pos, quat, joint, where)
 
 
@@ -168,8 +170,3 @@ def _check_width(rows: np.ndarray, width: int, where: str) -> None:
 
 def _texts(names: np.ndarray | None) -> list[str] | None:
     return None if names is None else [str(name) for name in names.tolist()]
-
-
-def _list(text: str | None) -> list[str] | None:
-    """Return the names in a metadata text: JSON, or names separated by commas."""
-    return None if not text else [name.strip(' "[]') for name in text.split(",")]

@@ -3,8 +3,7 @@
 A layout is a YAML file, or the policy.json of an export.
 """
 
-import ast
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from legged.config.bounds import LARGEST, between, items, positive
 from legged.config.checks import build
 from legged.config.yaml_files import read_yaml
 from legged.deploy.contract import Contract, read_contract
-from legged.deploy.policy import open_onnx, warm_up
+from legged.deploy.policy import listed, open_onnx, warm_up
 from legged.errors import ConfigError, suggest
 from legged.mdp.actuators.actuator import is_ideal
 from legged.process.paths import data_folder, exists
@@ -42,6 +41,8 @@ TERMS = {
 OF_TRACKERS = ("reference", "anchor_pos", "anchor_ori")
 """Terms that only trackers observe; `OF_WALKERS` are those that trackers do not observe."""
 OF_WALKERS = ("command_xy", "command_yaw", "phase_sin", "phase_cos")
+OF_TRACKER_LAYOUTS = ("task", "observation", "action_scale")
+"""Settings of a tracker's layout. The others come from its task and its file."""
 COMMANDS = ("command_xy", "command_yaw")
 """Terms of a layout for the two parts of the term `commands` of policy.json: its first two columns, and its third column."""
 JOINTS, STIFFNESS, DAMPING = (
@@ -118,6 +119,10 @@ def read_layout(name: str, where: str) -> Layout:
         if not data.get("observation"):
             raise ConfigError(f"{path}: observation: must name at least one term (allowed: {', '.join(TERMS)})")
         layout = build(Layout, data, str(path))
+        for key in data if layout.task else ():
+            if key not in OF_TRACKER_LAYOUTS:
+                allowed = ", ".join(OF_TRACKER_LAYOUTS)
+                raise ConfigError(f"{path}: {key}: has no effect in a layout with a task (allowed: {allowed})")
     for term in layout.observation:
         if term not in TERMS:
             raise ConfigError(f"{path}: observation: there is no term '{term}'{suggest(term, TERMS)}")
@@ -172,24 +177,6 @@ def was_trained_with_other_motors(contract: Contract) -> bool:
     """
     motors = build(ActuatorConfig, contract.actuator, f"{contract.path}: actuator")
     return not is_ideal(motors) or bool(motors.armature)
-
-
-def listed(path: Path, metadata: Mapping[str, str], keys: Sequence[str]) -> list[Any] | None:
-    """Return the list under the first of `keys` in the `metadata` of the ONNX file at `path`; None without such a key.
-
-    Raises:
-        ConfigError: the value is no list.
-    """
-    key = next((key for key in keys if key in metadata), None)
-    if key is None:
-        return None
-    try:
-        value = ast.literal_eval(metadata[key])
-    except (ValueError, SyntaxError, RecursionError, MemoryError):
-        value = [part.strip() for part in metadata[key].split(",")]
-    if not isinstance(value, list | tuple) or not value:
-        raise ConfigError(f"{path}: metadata {key}: expected a list")
-    return list(value)
 
 
 class ForeignPolicy:

@@ -120,6 +120,11 @@ def test_a_file_that_does_not_fit_is_named(inputs, changes, message):
     [
         ("observation: {reference: 1.0}", [], "reference: only trackers observe it, and their layout names a task"),
         ("task: g1_tracking\nobservation: {command_xy: 1.0}", [], "command_xy: trackers do not observe it"),
+        (
+            "task: g1_tracking\nobservation: {actions: 1.0}\ncontrol_dt: 0.01",
+            [],
+            "control_dt: has no effect in a layout with a task",
+        ),
         ("task: g1_tracking\nobservation: {actions: 1.0}", ["--robot", "g1"], "--robot: has no effect on a tracker"),
     ],
 )
