@@ -36,7 +36,7 @@ from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.sensors import Sensor
 from legged.mdp.terminations import Terminations
-from legged.physics import MODEL_FIELDS, Scene, check_ranges, make_physics, row_counts
+from legged.physics import FIELDS, Scene, check_ranges, make_physics, row_counts
 from legged.process.ranks import Ranks
 from legged.process.startup import stage_ended
 from legged.state import load_state, state_of, take, tensors_of, without_memory_of
@@ -135,14 +135,14 @@ class BaseTask(PrivilegedTerms, VecEnv):
                 has only one value.
         """
         cfg, where = self.cfg, self.cfg.origins.where
-        fields = [name for name in self.randomization.fields if name in MODEL_FIELDS]
+        fields = [name for name in self.randomization.fields if FIELDS[name].changes]
         check_ranges(cfg.domain_rand.ranges, scene, cfg.sim, where)
         others = (self.QUANTITIES, where, self.pushed_by_forces(), (name_module,))
         self.physics = make_physics(scene, cfg.sim, self.num_envs, self.device, fields, *others)
         self.kernels = task_kernels(self.physics)
         """Warp kernels that replace torch operations in parts of the step; None if the engine does not use Warp."""
         stage_ended("physics built")
-        self.field_rows = row_counts(scene, self.physics.model)
+        self.field_rows = row_counts(scene, self.physics.model, self.randomization.draws)
         for name, draw in self.randomization.draws.items():
             if draw.each and self.field_rows[name] < 2:
                 path = where(f"domain_rand.ranges.{name}.each")

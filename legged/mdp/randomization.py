@@ -12,7 +12,7 @@ from legged.config.robot import RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.random_pool import RandomPool
-from legged.physics import FIELDS, MODEL_FIELDS, Physics
+from legged.physics import FIELDS, Physics
 
 if TYPE_CHECKING:
     from legged.mdp.kernels.task import TaskKernels
@@ -104,7 +104,7 @@ class Randomization:
     def apply(self, physics: Physics) -> None:
         """Write the drawn values into the physics. The task calls this at the start, and after a saved state was loaded."""
         for field, values in self.fields.items():
-            if field in MODEL_FIELDS and field not in self.chosen_fields:
+            if FIELDS[field].changes and field not in self.chosen_fields:
                 physics.randomize(field, values)
         if self.chosen_fields:
             # `set_variants` derives constants, which is slow, so it is called only if the variants have changed.
@@ -160,8 +160,8 @@ class Randomization:
             self._chosen = self.chosen
             draw = self.draws[self.chosen_fields[0]]
             self._chosen_at = 1 if draw.when == "reset" else 2 + intervals.index(draw.interval_s)
-        known = {n: c for n, c in self.columns.items() if n in MODEL_FIELDS and n not in self.chosen_fields}
-        self._of_model = [name for name in own if name in MODEL_FIELDS]
+        known = {n: c for n, c in self.columns.items() if FIELDS[n].changes and n not in self.chosen_fields}
+        self._of_model = [name for name in own if FIELDS[name].changes]
         if self._of_model:
             physics.prepare_redraws(self.drawn, known, self._of_model)
 

@@ -9,7 +9,7 @@ import torch
 from legged.config.world import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.base import Physics
-from legged.physics.fields import FIELDS, MODEL_FIELDS, NEWTONS_FIELDS, row_counts
+from legged.physics.fields import FIELDS, NEWTONS_FIELDS, row_counts
 from legged.physics.quantities import check_quantities
 from legged.physics.randomized_model import check_ranges
 from legged.physics.robot_state import RobotState
@@ -19,7 +19,6 @@ from legged.process.startup import importing
 __all__ = [
     "FIELDS",
     "MANY_WORLDS",
-    "MODEL_FIELDS",
     "ModelScene",
     "Physics",
     "RobotScene",
@@ -85,8 +84,9 @@ def check_engine(
         ValueError: a field or a quantity does not exist.
     """
     for field in randomized:
-        if field not in MODEL_FIELDS:
-            raise ValueError(f"randomize: there is no model field '{field}'{suggest(field, MODEL_FIELDS, 'fields')}")
+        if field not in FIELDS or not FIELDS[field].changes:
+            known = [name for name in FIELDS if FIELDS[name].changes]
+            raise ValueError(f"randomize: there is no model field '{field}'{suggest(field, known, 'fields')}")
     check_quantities(quantities)
     if resolve_physics(sim.physics, device, where("sim.physics")) != "newton":
         return

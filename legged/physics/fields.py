@@ -1,7 +1,7 @@
 """Table of the fields that can be randomised, and of the arrays of MuJoCo's model that each field changes."""
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import mujoco
@@ -100,9 +100,39 @@ class Field:
     """True if each row of a world has its own random value by default, instead of one value for all rows."""
 
 
+OF_BODIES = {"added_mass": "added_base_mass"} | {f"com_{axis}": f"base_com_{axis}" for axis in "xyz"}
+"""Field of a named body -> the same field of the floating body."""
+
+
+class FieldTable(dict[str, Field]):
+    """Fields by name. `added_mass:BODY`, `com_x:BODY`, `com_y:BODY` and `com_z:BODY` are the fields of a named body. The
+    table makes them on demand, and does not list them.
+    """
+
+    def __missing__(self, name: str) -> Field:
+        kind, _, body = name.partition(":")
+        if not body or kind not in OF_BODIES:
+            raise KeyError(name)
+        of_base = self[OF_BODIES[kind]]
+
+        def rows(_: Scene, model: mujoco.MjModel) -> np.ndarray:
+            return np.array([k for k in range(1, model.nbody) if model.body(k).name == body], dtype=int)
+
+        meaning = of_base.meaning.replace("the floating body", body)
+        return replace(of_base, meaning=meaning, what=f"body '{body}'", rows=rows)
+
+    def __contains__(self, name: object) -> bool:
+        kind, _, body = str(name).partition(":")
+        return super().__contains__(name) or (bool(body) and kind in OF_BODIES)
+
+    def ordered(self, names: Collection[str]) -> list[str]:
+        """Return `names` in the order of the table, those of named bodies at the end."""
+        return [name for name in self if name in names] + [name for name in names if ":" in name]
+
+
 LEAST_MASS = 1e-6
 GRAVITY = "gravity"
-FIELDS = {
+_TABLE: dict[str, Field] = {
     "friction": Field(
         "sliding friction of the robot's shapes, or of all shapes of a scene without robot",
         "1",
@@ -240,18 +270,21 @@ FIELDS = {
         law=True,
     ),
 }
-"""Field name -> field. Fields that scale an array precede those that add to it."""
-MODEL_FIELDS = {name: field for name, field in FIELDS.items() if field.changes}
-"""Fields that change arrays of the model. `Physics.randomize` accepts these. All other fields affect only the control law."""
+FIELDS = FieldTable(_TABLE)
+"""Field name -> field. Fields that scale an array precede those that add to it. `Physics.randomize` accepts the fields that
+change arrays of the model. All other fields affect only the control law.
+"""
 
 NEWTONS_FIELDS = ("friction", "added_base_mass")
 """Fields that every solver of the engine `newton` supports, because the engine's own model has arrays for them. The
 engine's solver `mujoco` supports all fields."""
 
 
-def row_counts(scene: Scene, model: mujoco.MjModel) -> dict[str, int]:
-    """Return, for each field, the number of array rows that it changes, or the number of joints if it changes no array."""
-    return {name: len(field.rows(scene, model)) for name, field in FIELDS.items()}
+def row_counts(scene: Scene, model: mujoco.MjModel, names: Collection[str]) -> dict[str, int]:
+    """Return the number of array rows that each field of the table and each of `names` changes, or the number of joints if it
+    changes no array.
+    """
+    return {name: len(FIELDS[name].rows(scene, model)) for name in {*FIELDS, *names}}
 
 
 def own_array(model: mujoco.MjModel, name: str) -> np.ndarray:

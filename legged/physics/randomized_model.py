@@ -11,7 +11,7 @@ from torch import Tensor
 from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.world import SimConfig
 from legged.errors import ConfigError, suggest
-from legged.physics.fields import DERIVED, FIELDS, MODEL_FIELDS, Change, changed_arrays, own_array
+from legged.physics.fields import DERIVED, FIELDS, Change, changed_arrays, own_array
 from legged.physics.restitution import DampingOfBounces
 from legged.physics.scene import Scene
 
@@ -24,7 +24,7 @@ class RandomizedModel:
     ) -> None:
         """Prepare for values of `fields`. The arrays will have the type `dtype` and lie on `device`."""
         self.model, self._scene, self._dtype, self._device = model, scene, dtype, device
-        self.rows = {name: field.rows(scene, model) for name, field in MODEL_FIELDS.items() if name in fields}
+        self.rows = {name: FIELDS[name].rows(scene, model) for name in FIELDS.ordered(fields) if FIELDS[name].changes}
         """Field -> rows of the arrays that it changes."""
         self._values: dict[str, Tensor] = {}
         self.bounces = DampingOfBounces(device, dtype) if "restitution" in fields else None
@@ -121,12 +121,15 @@ def check_ranges(
             path = where("domain_rand.ranges")
             raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")
     given = RandomizedModel(scene, model, ranges, torch.float64, torch.device("cpu")) if model else None
-    for name, field in FIELDS.items():
-        if given is None or model is None or name not in ranges:
-            continue
+    for name in FIELDS.ordered(ranges):
+        assert given is not None
+        assert model is not None
+        field = FIELDS[name]
         path, low = where(f"domain_rand.ranges.{name}"), float(draw_of(ranges[name]).range[0])
         if not len(field.rows(scene, model)):
-            raise ConfigError(f"{path}: {scene.name} has no {field.what}")
+            bodies = [model.body(k).name for k in range(1, model.nbody)]
+            near = suggest(name.partition(":")[2], bodies, "bodies") if ":" in name else ""
+            raise ConfigError(f"{path}: {scene.name} has no {field.what}{near}")
         if name == "restitution" and (model.geom_solref[field.rows(scene, model), 0] <= 0.0).any():
             reason = "restitution needs contacts with a time constant, but these have a stiffness (a negative solref)"
             raise ConfigError(f"{path}: {scene.name}: {reason}")

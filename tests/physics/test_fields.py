@@ -12,7 +12,7 @@ from reference import CWorlds, random_states
 
 from legged.config.world import SimConfig
 from legged.errors import ConfigError
-from legged.physics import MODEL_FIELDS, ModelScene, Physics, RobotScene, check_ranges
+from legged.physics import FIELDS, ModelScene, Physics, RobotScene, check_ranges
 from legged.physics.fields import changed_arrays
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.randomized_model import RandomizedModel
@@ -89,6 +89,14 @@ def motor_strength(model: mujoco.MjModel, value: float) -> None:
     model.actuator_gear[:] *= value
 
 
+def added_mass_of_a_thigh(model: mujoco.MjModel, value: float) -> None:
+    model.body("left_thigh").mass += value
+
+
+def centre_of_a_thigh(model: mujoco.MjModel, value: float) -> None:
+    model.body("left_thigh").ipos[1] += value
+
+
 CHANGES = {  # by hand, and values for three worlds
     friction: (0.1, 0.6, 2.0),
     added_base_mass: (-3.0, 0.0, 10.0),
@@ -105,19 +113,23 @@ CHANGES = {  # by hand, and values for three worlds
     gravity_y: (-2.0, 0.0, 1.0),
     gravity_z: (-2.0, 0.0, 9.81),
     motor_strength: (0.5, 1.0, 1.3),
+    added_mass_of_a_thigh: (-2.0, 0.0, 5.0),
+    centre_of_a_thigh: (-0.05, 0.0, 0.1),
 }
+OF_BODIES = {"added_mass_of_a_thigh": "added_mass:left_thigh", "centre_of_a_thigh": "com_y:left_thigh"}
+KNOWN = tuple(name for name, field in FIELDS.items() if field.changes)
 
 
 @pytest.fixture(scope="module", params=ENGINES)
 def physics(request) -> Physics:
     """Three humanoids whose every field may be given."""
-    return build(HUMANOID, request.param, N, tuple(MODEL_FIELDS), **SETTINGS)
+    return build(HUMANOID, request.param, N, (*KNOWN, *OF_BODIES.values()), **SETTINGS)
 
 
 def give(physics: Physics, field: str, values: tuple[float, ...]) -> None:
     """Give one field its values, and all others those that change nothing; friction is 0.6 then."""
-    for name, known in MODEL_FIELDS.items():
-        physics.randomize(name, torch.full((N,), 0.6 if name == "friction" else known.neutral))
+    for name in (*KNOWN, *OF_BODIES.values()):
+        physics.randomize(name, torch.full((N,), 0.6 if name == "friction" else FIELDS[name].neutral))
     physics.randomize(field, torch.tensor(values))
 
 
@@ -145,14 +157,14 @@ def rollout(model: mujoco.MjModel, qpos: torch.Tensor, qvel: torch.Tensor, ctrl:
 
 
 def test_every_field_is_tested():
-    assert {change.__name__ for change in CHANGES} == set(MODEL_FIELDS) - {"torque_limit"}  # motors here have none
+    assert {change.__name__ for change in CHANGES} == {*KNOWN, *OF_BODIES} - {"torque_limit"}  # motors here have none
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_field_does_what_the_same_change_by_hand_does(physics, change):
     values = CHANGES[change]
-    give(physics, change.__name__, values)
+    give(physics, OF_BODIES.get(change.__name__, change.__name__), values)
     qpos, qvel = landing(physics.model)
     ctrl = 0.4 * torch.randn(STEPS, physics.model.nu, generator=torch.Generator().manual_seed(2))
     physics.write(torch.ones(N, dtype=torch.bool), qpos, qvel)
@@ -181,7 +193,7 @@ def test_values_given_again_replace_those_before(physics):
     give(physics, "link_mass", (0.5, 1.0, 2.0))
     for _ in range(2):
         physics.randomize("added_base_mass", torch.tensor([1.0, 2.0, 3.0]))
-    found = RandomizedModel(HUMANOID, model, MODEL_FIELDS, torch.float64, CPU)
+    found = RandomizedModel(HUMANOID, model, KNOWN, torch.float64, CPU)
     found.give("added_base_mass", torch.tensor([1.0, 2.0, 3.0]))
     found.give("added_base_mass", torch.tensor([1.0, 2.0, 3.0]))
     mass = found.give("link_mass", torch.tensor([0.5, 1.0, 2.0]))["body_mass"]
@@ -234,7 +246,7 @@ def test_a_servos_pull_towards_its_target_grows_with_its_gain(engine, tmp_path):
 # ---- the fused launches --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("field", MODEL_FIELDS)
+@pytest.mark.parametrize("field", KNOWN)
 def test_the_fused_step_takes_every_field_of_the_table(robot, field):
     """Its launches read the arrays per world, or leave them to those that make contacts and constraint rows."""
     model = RobotScene(robot).model(SimConfig())
@@ -283,6 +295,12 @@ def test_a_shipped_robot_without_dampers_can_be_given_some(robot, engine):
         ({"added_base_mass": (-50.0, 1.0)}, r"ranges.added_base_mass: .* makes body_mass -4"),
         ({"link_mass": (0.0, 1.0)}, r"ranges.link_mass: .* makes body_mass 0"),
         ({"link_mass": (0.1, 1.0), "added_base_mass": (-2.0, 0.0)}, r"ranges.added_base_mass: .* makes body_mass "),
+        (
+            {"com_x:left_thihg": (0.0, 1.0)},
+            r"ranges.com_x:left_thihg: .* has no body 'left_thihg'; did you mean 'left_thigh'\?",
+        ),
+        ({"added_mass:left_thigh": (-5.0, 1.0)}, r"ranges.added_mass:left_thigh: .* \(mass added to left_thigh\), makes"),
+        ({"com:left_thigh": (0.0, 1.0)}, r"domain_rand.ranges: there is no field 'com:left_thigh'"),
         ({"joint_damping": (-1.5, 1.0)}, r"ranges.joint_damping: .* makes dof_damping -0.5"),
     ],
 )

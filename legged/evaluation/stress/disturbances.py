@@ -13,7 +13,7 @@ from legged.math import quat_rotate
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.sensors.height_scan import HeightScan
-from legged.physics import FIELDS, MODEL_FIELDS, Scene
+from legged.physics import FIELDS, Scene
 from legged.registry import task_class
 from legged.robots.similarity import Size, grown
 from legged.terrain import Terrain
@@ -194,7 +194,7 @@ class StressedTask(LeggedRobot):
         given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
         given = {name: values for name, values in given.items() if name in self.cfg.domain_rand.ranges}
         self.control.vary(given)
-        for name in given.keys() & MODEL_FIELDS:
+        for name in (name for name in given if FIELDS[name].changes):
             self.physics.randomize(name, given[name])
         self.reset()
 
