@@ -285,7 +285,7 @@ class RobotsCamera(Camera):
         self.arrows = True
         """True if the arrows of velocities are drawn."""
         self.ghost = Ghost(task, self.model) if is_tracking_task(task) else None
-        """Drawing of the references; None if there are none, or if they are not drawn."""
+        """Ghosts of the robots. None draws no ghosts; a task without references has none."""
         self.ground = None if task.terrain is None else task.terrain.height_map
         if self.ground is None:
             self.offsets = SPACING * length * side_by_side(count, int(np.ceil(count**0.5)))
