@@ -62,6 +62,9 @@ def motion(args: argparse.Namespace) -> int:
     for name in {clip.name for clip in clips}:
         if sum(clip.name == name for clip in clips) > 1:
             raise ConfigError(f"FILE: two files are named '{name}', so one clip would be written over the other")
+    for path in args.files:
+        if path.resolve() == (args.out / f"{path.stem}.npz").resolve():
+            raise ConfigError(f"--out: {relative(path)} would be overwritten by its resampled clip; name another folder")
     ready_to_write(args.out)
     measured = [quality_of(clip, skeleton) for clip in clips]
     rows = [_row(clip, quality) for clip, quality in zip(clips, measured, strict=True)]
