@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from legged.deploy.pace import take_priority
 from legged.errors import ConfigError, RunError
 from legged.learning.run_folder import CONFIG_FILE, checkpoints, run_config
 from legged.mdp.actuators.motor_curve import with_rotors
-from legged.play.films import write_mp4
+from legged.play.films import mp4
 from legged.policies.export import EXPORTED, export
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import exists, make_folder, ready_to_write, relative, replacing, write_text
@@ -327,15 +328,14 @@ def make_film(robot: Robot, terrain: Terrain | None, folder: Path) -> None:
         print(f"{folder}: no film, because the run was too short")
         return
     camera = Camera(display_model(robot, 1, *SIZE, terrain), *SIZE)
+    fps = (len(poses) - 1) / max(poses[-1, 0] - poses[0, 0], 1e-3)
     follower = Follower(camera.view, AWAY * size_of(robot).max(), None if terrain is None else terrain.height_map)
-    frames = []
-    for time, *qpos in poses:
-        camera.data.qpos[:] = qpos
-        base = np.array(qpos[:3])
-        follower.update(base)
-        camera.update()
-        place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
-        state = log["states"][log["state"][place]]
-        frames.append(caption(camera.render(), [f"{robot.name}: {state}", f"{time:.1f} s, {base[0]:+.1f} m forward"]))
-    camera.close()
-    write_mp4(frames, folder / FILM, (len(poses) - 1) / max(poses[-1, 0] - poses[0, 0], 1e-3))
+    with closing(camera), mp4(folder / FILM, fps, *SIZE) as append:
+        for time, *qpos in poses:
+            camera.data.qpos[:] = qpos
+            base = np.array(qpos[:3])
+            follower.update(base)
+            camera.update()
+            place = min(int(np.searchsorted(log["times"], time)), len(log["times"]) - 1)
+            state = log["states"][log["state"][place]]
+            append(caption(camera.render(), [f"{robot.name}: {state}", f"{time:.1f} s, {base[0]:+.1f} m forward"]))

@@ -14,9 +14,9 @@ from legged.motion.checks import SOFT, Quality, quality_of
 from legged.motion.clip import Clip, write_clip
 from legged.motion.kinematics import Skeleton
 from legged.motion.readers import CSV_FPS, read_clip
-from legged.play.films import write_mp4
+from legged.play.films import mp4
 from legged.process.paths import ready_to_write, relative
-from legged.rendering.clip_pictures import pictures_of
+from legged.rendering.clip_pictures import SIZE, pictures_of
 from legged.robots.robot import load_robot
 from legged.tables import screen_table
 
@@ -62,6 +62,9 @@ def motion(args: argparse.Namespace) -> int:
     for name in {clip.name for clip in clips}:
         if sum(clip.name == name for clip in clips) > 1:
             raise ConfigError(f"FILE: two files are named '{name}', so one clip would be written over the other")
+    for path in args.files:
+        if path.resolve() == (args.out / f"{path.stem}.npz").resolve():
+            raise ConfigError(f"--out: {relative(path)} would be overwritten by its resampled clip; name another folder")
     ready_to_write(args.out)
     measured = [quality_of(clip, skeleton) for clip in clips]
     rows = [_row(clip, quality) for clip, quality in zip(clips, measured, strict=True)]
@@ -76,7 +79,9 @@ def motion(args: argparse.Namespace) -> int:
         print(f"written: {relative(path)} and {path.with_suffix('.png').name}")
         if not args.no_film:
             every = max(1, round(clip.fps / FILM_FPS))
-            write_mp4(list(pictures_of(clip, robot, every)), path.with_suffix(".mp4"), clip.fps / every)
+            with mp4(path.with_suffix(".mp4"), clip.fps / every, *SIZE) as append:
+                for picture in pictures_of(clip, robot, every):
+                    append(picture)
     return 0
 
 

@@ -22,7 +22,7 @@ from legged.commandline.command import sub_command
 from legged.config import follows_velocities, override
 from legged.deploy.command_parser import argument
 from legged.envs import is_velocity_task
-from legged.errors import ConfigError, RunError
+from legged.errors import ConfigError
 from legged.learning.run_folder import find_run, run_config
 from legged.play.demonstrations import EPISODE_S, SCHEDULE, follow_schedule, roll_out, walk_out
 from legged.play.films import Video
@@ -91,19 +91,12 @@ def play(args: argparse.Namespace) -> int:
     elif not (args.no_video or args.headless) and "DISPLAY" in os.environ:
         print(f"the display {os.environ['DISPLAY']} (DISPLAY) does not answer: recording only")
     shown = min(task.num_envs, len(playground.order) if playground else MOST_SHOWN)
-    failure = None
-    try:
-        video = Video(task, shown, None if args.no_video else folder, args.gif)
-    except RunError as error:  # this machine cannot render, but the policy is still measured
-        video, failure = Video(task, shown, None), error
-    if not is_velocity_task(task):
-        result = roll_out(task, act, video)
-    else:
-        result = walk_out(task, act, playground, video) if playground else follow_schedule(task, act, video)
-    Console(width=90).print(result)
-    if failure is not None:
-        raise failure
-    video.write()
+    with Video(task, shown, None if args.no_video else folder, args.gif) as video:
+        if not is_velocity_task(task):
+            result = roll_out(task, act, video)
+        else:
+            result = walk_out(task, act, playground, video) if playground else follow_schedule(task, act, video)
+        Console(width=90).print(result)
     return 0
 
 

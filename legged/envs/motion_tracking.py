@@ -5,7 +5,7 @@ At the end of a control step, a robot should have reached its frame of the motio
 """
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeGuard
 
 import torch
 from tensordict import TensorDict
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from legged.config.task import TaskConfig
 from legged.config.tracking import TrackingConfig, tracks_motions
+from legged.envs.base_task import BaseTask
 from legged.envs.marks import concurrent, unit
 from legged.envs.robot_task import RobotTask
 from legged.errors import ConfigError
@@ -287,6 +288,11 @@ class MotionTracking(RobotTask):
 
     def _anchor_quats(self) -> tuple[Tensor, Tensor]:
         return self.motion.now.quat[:, self._anchor], self.bodies.quat[:, self._anchor]
+
+
+def is_tracking_task(task: BaseTask) -> TypeGuard[MotionTracking]:
+    """Return whether a task's robots track reference motions."""
+    return isinstance(task, MotionTracking)
 
 
 def _clips(cfg: TrackingConfig, skeleton: Skeleton) -> list[Clip]:

@@ -135,6 +135,7 @@ class Projector:
         camera, frames = camera_of(self.task, 1, WIDTH, HEIGHT), []
         if isinstance(camera, RobotsCamera):
             camera.come_near(FILL, GLIDE)
+            camera.ghost = None  # no reference is recorded
         try:
             for step in shown:
                 self._put(self.episodes.of(number), step)

@@ -25,6 +25,11 @@ class Frames:
         self.pos, self.quat, self.lin_vel, self.ang_vel = (part.view(m, bodies, -1) for part in parts[6:])
         """(M, B, 3) positions of bodies [m]; (M, B, 4) orientations; (M, B, 3) velocities of their origins [m/s, rad/s]."""
 
+    @property
+    def qpos(self) -> Tensor:
+        """(M, 7 + D) poses in the order of `Physics.qpos`: position of the base [m], orientation, joint angles [rad]."""
+        return torch.cat([self.root_pos, self.root_quat, self.joint_pos], dim=1)
+
 
 class ReferenceMotion:
     """The frames of all clips in one table, and the frame of each of N robots.

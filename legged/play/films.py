@@ -2,10 +2,12 @@
 
 import errno
 import subprocess
+import tempfile
 import time
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -46,28 +48,40 @@ SMALLER: tuple[tuple[int, float], ...] = (
 
 
 class Video:
-    """Recorder of a film of a task's first robots; without a folder it records nothing."""
+    """Recorder of a film of a task's first robots: play.mp4 and, with `gif`, a smaller play.gif. Without a folder it records
+    nothing. The end of the `with` block completes the files. Only there does it raise what keeps the film from being made,
+    because the robots are measured all the same.
+    """
 
     def __init__(self, task: BaseTask, count: int, folder: Path | None, gif: bool = False) -> None:
         """Create the camera and the folder.
 
         Raises:
-            RunError: this machine cannot render, or the folder cannot be created.
+            RunError: the folder cannot be created.
         """
         self.folder, self.gif = folder, gif
         self.camera: Any = None
-        if folder:
-            try:
-                self.camera = camera_of(task, count)
-            except RunError as error:
-                raise RunError(f"{error}, or play with --no-video") from error
-            make_folder(folder)
         self.every = max(1, round(1.0 / (PLAY_FPS * task.dt)))
         """Number of control steps from one frame to the next."""
         self.fps = 1.0 / (self.every * task.dt)
         """Frames per second with which the film runs in real time."""
-        self.frames: Film = []
+        self.count = 0
+        """Number of recorded frames."""
+        self._failure: RunError | BrokenPipeError | None = None
+        self._film = ExitStack()
+        self._append: Callable[[np.ndarray], object] | None = None
+        self._small: Film = []
+        self._small_every = max(1, round(self.fps / GIF_FPS))
+        if folder:
+            try:
+                self.camera = camera_of(task, count)
+            except RunError as error:
+                self._failure = RunError(f"{error}, or play with --no-video")
+            make_folder(folder)
         self._start = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        return self
 
     def due(self, step: int) -> bool:
         """Return whether a frame is due after this control step."""
@@ -75,25 +89,40 @@ class Video:
 
     def take(self, *lines: str, followed: int = 0) -> None:
         """Record a frame with `lines` of text. On terrain the camera follows the robot with index `followed`."""
+        assert self.folder is not None
         self.camera.followed = followed
-        self.frames.append(self.camera.picture(lines))
+        picture = self.camera.picture(lines)
+        if self.gif and self.count % self._small_every == 0 and self.count < max(1, round(GIF_S * self.fps)):
+            self._small.append(resized(picture, *GIF_SIZE))
+        self.count += 1
+        if self._failure is not None:
+            return
+        try:
+            if self._append is None:
+                height, width, _ = picture.shape
+                self._append = self._film.enter_context(mp4(self.folder / "play.mp4", self.fps, width, height))
+            self._append(picture)
+        except (RunError, BrokenPipeError) as error:
+            self._failure = error
 
-    def write(self) -> None:
-        """Write play.mp4 and, with `gif`, a smaller play.gif.
+    def __exit__(self, *raised: Any) -> None:
+        """Complete the files; if the block failed, remove them.
 
         Raises:
-            RunError: a file cannot be written.
+            RunError: this machine cannot render, or a file cannot be written.
         """
-        if self.camera is None or self.folder is None:
-            return
-        self.camera.close()
-        if self.gif:  # the GIF is written first, because it needs no encoder that may fail
-            every = max(1, round(self.fps / GIF_FPS))
-            shown = [resized(frame, *GIF_SIZE) for frame in self.frames[: max(1, round(GIF_S * self.fps)) : every]]
-            write_film(shown, self.folder / "play.gif", self.fps / every)
-            print(f"video {relative(self.folder / 'play.gif')}")
-        write_mp4(self.frames, self.folder / "play.mp4", self.fps)
-        print(f"recorded {len(self.frames)} frames in {time.perf_counter() - self._start:.1f} s")
+        with self._film:
+            if self.camera is not None:
+                self.camera.close()
+            if raised[1] is not None:
+                raise raised[1]
+            if self._small and self.folder is not None:  # the GIF needs no encoder that may fail
+                write_film(self._small, self.folder / "play.gif", self.fps / self._small_every)
+                print(f"video {relative(self.folder / 'play.gif')}")
+            if self._failure is not None:
+                raise self._failure
+        if self.count:
+            print(f"recorded {self.count} frames in {time.perf_counter() - self._start:.1f} s")
 
 
 def walker(policy: TrainedPolicy, where: str = "") -> LeggedConfig:
@@ -158,8 +187,10 @@ def resized(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.asarray(Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS))
 
 
-def write_mp4(frames: Film, path: Path, fps: float) -> None:
-    """Write pictures as a film with `fps` pictures per second.
+@contextmanager
+def mp4(path: Path, fps: float, width: int, height: int) -> Iterator[Callable[[np.ndarray], object]]:
+    """Provide a function that appends a picture (`height`, `width`, 3) uint8 to a film with `fps` pictures per second. Each
+    picture is encoded at once. The film replaces `path` after the block, or is removed if the block fails.
 
     Raises:
         RunError: the film cannot be written.
@@ -170,18 +201,23 @@ def write_mp4(frames: Film, path: Path, fps: float) -> None:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as error:
         raise RunError(f"{relative(path)}: videos need ffmpeg: pip install 'imageio[ffmpeg]' ({error})") from error
-    height, width, _ = frames[0].shape
     given = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
     wanted = ["-an", "-codec:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2"]
-    with replacing(path) as part:
+    with replacing(path) as part, tempfile.TemporaryFile() as output:
         command = [program, "-y", "-loglevel", "error", *given, *wanted, str(part)]
-        # ffmpeg reports a full disk by its exit code and its error output.
-        done = subprocess.run(command, input=np.stack(frames).tobytes(), capture_output=True, check=False)
-        if done.returncode:
-            said = done.stderr.decode("utf-8", errors="replace").strip().splitlines() or [f"exit code {done.returncode}"]
+        encoder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, stderr=output)
+        # If ffmpeg ends early, the pipe breaks. Its exit code and its output tell the reason, such as a full disk.
+        with suppress(BrokenPipeError), encoder:
+            assert encoder.stdin is not None
+            pipe = encoder.stdin
+            yield lambda picture: pipe.write(picture.tobytes())
+        if encoder.returncode:
+            output.seek(0)
+            said = output.read().decode("utf-8", errors="replace").strip().splitlines()
             if any("No space left" in line or "quota" in line for line in said):
                 raise OSError(errno.ENOSPC, DISK_FULL)
-            raise RunError(f"{relative(path)}: ffmpeg could not write the video: {said[0]}")
+            reason = said[0] if said else f"exit code {encoder.returncode}"
+            raise RunError(f"{relative(path)}: ffmpeg could not write the video: {reason}")
     print(f"video {relative(path)}")
 
 

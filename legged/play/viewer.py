@@ -2,13 +2,16 @@
 
 import time
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 
 from legged.envs import BaseTask, is_robot_task, is_velocity_task
+from legged.envs.motion_tracking import is_tracking_task
 from legged.play.playground import Playground
 from legged.policies.episodes import Policy
 from legged.rendering.camera import drawn_model, follow_root, size_of
+from legged.rendering.ghost import Ghost
 from legged.rendering.scene import display_model
 
 STEP = (0.1, 0.1, 0.2)
@@ -54,6 +57,7 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
     low, high = steered.command_sampler.full_ranges.t().tolist() if steered else ([0.0] * 3, [0.0] * 3)
     keyboard = Keyboard(low, high)
     model = display_model(legged.robot, 1, 640, 480, legged.terrain) if legged else drawn_model(task, 640, 480)
+    ghost = Ghost(task, model) if is_tracking_task(task) else None
     data, simulated = mujoco.MjData(model), mujoco.MjData(task.physics.model)
     print(HELP if steered else HELP_WITHOUT_COMMANDS)
     if playground:
@@ -78,6 +82,9 @@ def view(task: BaseTask, act: Policy, playground: Playground | None = None) -> N
                 task.physics.copy_to(0, simulated)
                 data.qpos[:], data.qvel[:] = simulated.qpos, simulated.qvel
                 mujoco.mj_forward(model, data)
+                if ghost is not None:
+                    window.user_scn.ngeom = 0
+                    ghost.draw(window.user_scn, window.opt, 0, np.zeros((1, 3)))
             window.sync()
             time.sleep(max(0.0, task.dt - (time.perf_counter() - begin)))
 

@@ -16,9 +16,11 @@ from mujoco.rendering.classic import gl_context
 from PIL import Image, ImageDraw, ImageFont
 
 from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
+from legged.envs.motion_tracking import is_tracking_task
 from legged.errors import RunError
 from legged.process import headless
 from legged.process.headless import HEADLESS, off_screen_library
+from legged.rendering.ghost import Ghost
 from legged.rendering.scene import display_model
 from legged.robots.importing.convert import robot_spec_of
 from legged.robots.robot import Robot
@@ -133,7 +135,7 @@ def make_renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Rend
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # glfw warns before it fails
-            return mujoco.Renderer(model, height, width, max_geom=model.ngeom + 1000)
+            return mujoco.Renderer(model, height, width, max_geom=2 * model.ngeom + 1000)
     except Exception as error:  # each GL library has its own exceptions
         needed = "on a machine without a display, install EGL or OSMesa and set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
         raise RunError(f"cannot render here ({error}); {needed}") from error
@@ -262,7 +264,8 @@ class Follower:
 class RobotsCamera(Camera):
     """A camera for `count` robots of a task: the first ones, or those that `turn_to` selects. On a plane the robots are drawn
     side by side, and the camera follows their middle. On terrain it follows one of them, the robot number `followed`. Arrows
-    show the commanded and the actual velocity of robots that follow velocity commands.
+    show the commanded and the actual velocity of robots that follow velocity commands. Ghosts show the references of robots
+    that track motions.
     """
 
     def __init__(self, task: RobotTask, count: int, width: int = 960, height: int = 540) -> None:
@@ -281,6 +284,8 @@ class RobotsCamera(Camera):
         """(3,) point that the camera looks at on a plane, relative to the ground below the middle of the robots [m]."""
         self.arrows = True
         """True if the arrows of velocities are drawn."""
+        self.ghost = Ghost(task, self.model) if is_tracking_task(task) else None
+        """Ghosts of the robots. None draws no ghosts; a task without references has none."""
         self.ground = None if task.terrain is None else task.terrain.height_map
         if self.ground is None:
             self.offsets = SPACING * length * side_by_side(count, int(np.ceil(count**0.5)))
@@ -321,6 +326,8 @@ class RobotsCamera(Camera):
         self.follower.update(middle if self.ground is None else bases[self.followed])
         self.update()
         self._shade_feet()
+        if self.ghost is not None:
+            self.ghost.draw(self.renderer.scene, self.options, self.first, self.offsets)
         if self.arrows and is_velocity_task(self.task):
             self._draw_velocities(self.task, bases, drawn)
         return caption(self.render(), lines, (COMMANDED, ACTUAL))

@@ -11,19 +11,21 @@ from legged.rendering.camera import Camera, caption, size_of
 from legged.rendering.scene import display_model
 from legged.robots.robot import Robot
 
+SIZE = 640, 480
+"""Width and height of a picture [pixels]."""
 DISTANCE, ELEVATION = 2.2, -12.0
 """Distance of the camera in lengths of the robot, and its elevation [degrees]."""
 GLIDE = 0.08
 """Share of its distance to the robot that the point in the camera's centre moves in each picture."""
 
 
-def pictures_of(clip: Clip, robot: Robot, every: int = 1, width: int = 640, height: int = 480) -> Iterator[np.ndarray]:
+def pictures_of(clip: Clip, robot: Robot, every: int = 1) -> Iterator[np.ndarray]:
     """Yield a picture (height, width, 3) uint8 of every `every`-th frame.
 
     Raises:
         RunError: this machine cannot render.
     """
-    with closing(Camera(display_model(robot, 1, width, height), width, height)) as camera:
+    with closing(Camera(display_model(robot, 1, *SIZE), *SIZE)) as camera:
         view, joints = camera.view, [camera.model.joint(f"0/{name}").qposadr[0] for name in robot.joint_names]
         view.type, view.distance = mujoco.mjtCamera.mjCAMERA_FREE, DISTANCE * float(size_of(robot).max())
         view.azimuth, view.elevation = 130.0, ELEVATION

@@ -337,3 +337,13 @@ def test_two_clips_of_one_name_are_refused(robot, skeleton, capsys):
     path = own_file(robot, skeleton, wave(robot))
     assert main(["motion", str(path), str(path), "--no-film"]) == 2
     assert "two files are named 'clip'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("folder", [".", "link"])
+def test_a_clip_is_not_written_over_its_own_file(folder, robot, skeleton, capsys):
+    path = own_file(robot, skeleton, wave(robot, fps=30.0))
+    before = path.read_bytes()
+    Path("link").symlink_to(".")
+    assert main(["motion", str(path), "--no-film", "--out", folder]) == 2
+    assert f"--out: {path} would be overwritten by its resampled clip; name another folder" in capsys.readouterr().err
+    assert path.read_bytes() == before

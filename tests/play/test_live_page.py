@@ -20,6 +20,8 @@ from PIL import Image
 from legged.learning.run_folder import run_config
 from legged.play.live.page import HOST, Page, free_port, load_viser, refusing_other_sites, url
 from legged.play.live.session import Session, Watched, changes_for, check_ground
+from legged.registry import task_config
+from legged.rendering.ghost import GHOST
 
 pytest.importorskip("viser", reason="the extra `watch` is not installed")
 
@@ -134,6 +136,25 @@ def test_another_ground_is_drawn():
         page.session.task.base_pos[0, 0] += 1.0
         page.drawing.draw()
         assert -np.array(page.drawing._world.position) == pytest.approx(middle, abs=0.05)
+    finally:
+        page.close()
+
+
+def test_the_followed_tracker_has_its_reference_beside_it(tmp_path):
+    cfg = task_config("g1_tracking", on_cpu=True)
+    session = Session(Watched(cfg, tmp_path), changes_for(cfg, 2, ENGINE), check_ground(cfg, None, None))
+    page = Page(session, HOST, free_port(HOST, 0))
+    try:
+        session.step()
+        for robot in (0, 1):
+            session.select(robot)
+            page.drawing.draw()
+            ghost, now = page.drawing._nodes[-1], session.task.motion.now
+            assert len(ghost) == len(page.drawing._nodes[robot])
+            assert {node.opacity for node in ghost} == {GHOST[3]}
+            base = now.root_pos[robot].numpy() + page.drawing._offsets[robot]
+            assert ghost[0].position == pytest.approx(base.tolist(), abs=1e-4)
+            assert np.abs(ghost[0].wxyz @ now.root_quat[robot].numpy()) == pytest.approx(1.0)
     finally:
         page.close()
 

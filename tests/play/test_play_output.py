@@ -1,12 +1,16 @@
 """What play shows and writes where something is in its way: long control steps, full disks, displays that refuse."""
 
 import errno
-import subprocess
+import weakref
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from helpers import POLICY, TASK, call, small_config, small_task, stand
+from PIL import Image
 
 import legged.policies.restore
 from legged.cli.play import play
@@ -44,11 +48,10 @@ def short(monkeypatch):
 def test_a_command_that_is_over_before_it_is_measured_has_no_error(short):
     """One control step lasts 1.25 s, the command 0.2 s: one step, in whose first second nothing is measured."""
     task = small_task(("control.decimation", 250), num_envs=2)
-    film = films.Video(task, 1, Path("film"))
-    table = demonstrations.follow_schedule(task, stand, film)
+    with films.Video(task, 1, Path("film")) as film:
+        table = demonstrations.follow_schedule(task, stand, film)
     assert list(table.columns[1].cells) == ["-"]
     assert film.fps == pytest.approx(1 / task.dt)
-    film.write()
     assert Path("film/play.mp4").stat().st_size > 0
 
 
@@ -72,26 +75,101 @@ def test_a_robot_that_fell_is_not_measured_until_it_has_settled_again(short, mon
     monkeypatch.setattr(demonstrations, "SCHEDULE", ((3.0, (0.5, 0.0, 0.0)),))
     monkeypatch.setattr(demonstrations, "TrackingErrors", Kept)
     task = Falling(small_config(num_envs=2))
-    demonstrations.follow_schedule(task, stand, films.Video(task, 1, Path("film")))
+    demonstrations.follow_schedule(task, stand, films.Video(task, 1, None))
     assert kept[0].falls.tolist() == [2.0, 2.0]
     assert kept[0].steps.tolist() == [19.0, 19.0]
 
 
 @pytest.mark.slow
-def test_a_film_that_does_not_fit_costs_no_table(short, monkeypatch, capsys):
-    real = subprocess.run
-
-    def run(command, **options):
-        if "libx264" in command:
-            return subprocess.CompletedProcess(command, 228, b"", b"Error writing trailer: No space left on device\n")
-        return real(command, **options)
-
-    monkeypatch.setattr(films.subprocess, "run", run)
+@pytest.mark.parametrize("first", ["exec < /dev/null", "cat > /dev/null"])  # it ends at once, and after all pictures
+def test_a_film_that_does_not_fit_costs_no_table(first, short, monkeypatch, capsys):
+    encoder_that(monkeypatch, f"{first}; echo Error writing trailer: No space left on device >&2; exit 228")
     assert call(play.main, [*HERE, "--headless", "--num_envs", "1", "--out", "out"]) == 1
     out, err = capsys.readouterr()
     assert "following commands" in out
     assert err == f"error: out/play.mp4: {DISK_FULL}\n"
     assert [path.name for path in Path("out").iterdir()] == ["exported"]
+
+
+def encoder_that(monkeypatch, script: str) -> None:
+    """Replace ffmpeg by a shell script."""
+    path = Path("ffmpeg").absolute()
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: str(path))
+
+
+class Pictures:
+    """Makes noisy pictures, and counts those that exist."""
+
+    def __init__(self):
+        self.random, self.made, self.most = np.random.default_rng(0), [], 0
+
+    def make(self) -> np.ndarray:
+        picture = self.random.integers(0, 255, (180, 320, 3), dtype=np.uint8)
+        self.made.append(weakref.ref(picture))
+        self.most = max(self.most, sum(made() is not None for made in self.made))
+        return picture
+
+
+def frames_in(path: Path) -> int:
+    return imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+
+
+def test_a_film_keeps_no_pictures():
+    pictures = Pictures()
+    with films.mp4(Path("a.mp4"), 25.0, 320, 180) as append:
+        for _ in range(60):
+            append(pictures.make())
+    assert pictures.most == 1
+    assert frames_in(Path("a.mp4")) == 60
+
+
+@pytest.mark.parametrize("gif", [False, True])
+def test_a_film_of_play_keeps_no_pictures(gif, monkeypatch):
+    """A GIF keeps its own, which are small and few."""
+    pictures = Pictures()
+
+    class Camera(FakeCamera):
+        def picture(self, _caption):
+            return pictures.make()
+
+    monkeypatch.setattr(films, "camera_of", Camera)
+    with films.Video(SimpleNamespace(dt=0.02), 1, Path("film"), gif) as film:
+        taken = [film.take("") for step in range(100) if film.due(step)]
+    assert pictures.most == 1
+    assert frames_in(Path("film/play.mp4")) == len(taken) == film.count == 50
+    assert sorted(path.name for path in Path("film").iterdir()) == ["play.gif", "play.mp4"][not gif :]
+    if gif:
+        assert Image.open("film/play.gif").n_frames == 17  # every third one of 50
+
+
+def test_a_film_that_is_broken_off_leaves_the_earlier_one():
+    def break_off() -> None:
+        with films.mp4(Path("film/a.mp4"), 25.0, 32, 18) as append:
+            append(np.zeros((18, 32, 3), dtype=np.uint8))
+            raise KeyboardInterrupt
+
+    leaves_the_earlier_film(break_off, Path("film/a.mp4"))
+
+
+def test_a_film_of_play_that_is_broken_off_leaves_the_earlier_one(monkeypatch):
+    def break_off() -> None:
+        with films.Video(SimpleNamespace(dt=0.02), 1, Path("film"), gif=True) as film:
+            film.take("")
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(films, "camera_of", FakeCamera)
+    leaves_the_earlier_film(break_off, Path("film/play.mp4"))
+
+
+def leaves_the_earlier_film(break_off: Callable[[], None], path: Path) -> None:
+    path.parent.mkdir()
+    path.write_text("earlier")
+    with pytest.raises(KeyboardInterrupt):
+        break_off()
+    assert path.read_text() == "earlier"
+    assert list(path.parent.iterdir()) == [path]
 
 
 @pytest.mark.slow

@@ -228,9 +228,8 @@ def test_each_episode_shows_another_robot_and_says_what_is_below_it(monkeypatch,
     monkeypatch.setattr(FakeCamera, "shots", [])
     ground = playground(config(), difficulty=0.5)
     task = on(ground, config(), num_envs=2)
-    film = films.Video(task, 2, tmp_path)
-    demonstrations.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
-    film.write()
+    with films.Video(task, 2, tmp_path) as film:
+        demonstrations.walk_out(task, lambda _: torch.zeros(2, 12), ground, film)
     up, down = (0, "stairs_up, step height 0.14 m"), (1, "stairs_down, step height 0.14 m")
     assert FakeCamera.shots == [up, up, down, down, up, up]
     assert (tmp_path / "play.mp4").is_file()

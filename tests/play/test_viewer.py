@@ -11,6 +11,7 @@ from legged.config import override
 from legged.play.playground import SETTING, Playground
 from legged.play.viewer import BACKSPACE, COMMA, DOWN, LEFT, NEXT, RIGHT, SPACE, UP, Keyboard, begin_anew, view
 from legged.registry import make_task, task_config
+from legged.rendering.ghost import GHOST
 
 
 def test_each_key_moves_its_own_axis_by_its_step():
@@ -79,8 +80,9 @@ def test_on_a_plane_robots_just_begin_anew(capsys):
 class FakeWindow:
     """A window that is open for five pictures, in whose third somebody presses backspace."""
 
-    def __init__(self, data, press) -> None:
+    def __init__(self, data, press, scene=None) -> None:
         self.data, self.press, self.cam, self.seen = data, press, mujoco.MjvCamera(), []
+        self.opt, self.user_scn = mujoco.MjvOption(), scene
 
     def is_running(self) -> bool:
         if len(self.seen) == 3:
@@ -112,3 +114,24 @@ def test_a_task_without_commands_is_shown_as_it_is_simulated(monkeypatch):
     assert lengths == [0, 1, 2, 0, 1]  # it began anew
     assert abs(torch.tensor(windows[0].seen[-1]) - task.physics.qpos[0]).max() < 1e-5
     assert windows[0].cam.trackbodyid == 1
+
+
+def test_a_tracker_is_shown_beside_its_reference(monkeypatch):
+    task = make_task(task_config("g1_tracking", [*ENGINE, ("env.num_envs", 1)], on_cpu=True))
+    scenes, shapes = [], []
+
+    @contextlib.contextmanager
+    def launch(model, data, key_callback, **_):
+        scenes.append(mujoco.MjvScene(model, 1000))
+        yield FakeWindow(data, key_callback, scenes[0])
+
+    def act(_observations):
+        shapes.append(scenes[0].ngeom)
+        return torch.zeros(1, task.num_actions)
+
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
+    view(task, act)
+    assert shapes[0] == 0
+    assert shapes[1] > task.robot.num_dof
+    assert set(shapes[1:]) == {shapes[1]}  # each picture replaces the last one's ghost
+    assert {geom.rgba[3] for geom in scenes[0].geoms[: shapes[1]]} == {GHOST[3]}

@@ -1,4 +1,4 @@
-"""Robots, arrows for velocities, and the ground in viser's scene. Meshes have a normal for each vertex."""
+"""Robots, a reference, arrows for velocities, and the ground in viser's scene. Meshes have a normal for each vertex."""
 
 from typing import Any
 
@@ -7,15 +7,18 @@ import numpy as np
 import torch
 import trimesh
 from PIL import Image
+from torch import Tensor
 from trimesh.visual import TextureVisuals
 from trimesh.visual.color import srgb_to_linear
 from trimesh.visual.material import PBRMaterial
 
 from legged.envs import is_robot_task, is_velocity_task
+from legged.envs.motion_tracking import is_tracking_task
 from legged.math import yaw_of
 from legged.play.live.plots import ACTUAL, COMMANDED
 from legged.play.live.session import Session
 from legged.rendering import camera
+from legged.rendering.ghost import GHOST
 from legged.rendering.scene import add_horizon, add_painted_terrain
 from legged.robots.importing.convert import robot_spec_of
 from legged.terrain import Terrain
@@ -110,6 +113,10 @@ class Drawing:
             [scene.add_mesh_trimesh(f"/world/bodies/{robot}/{body}", mesh) for body, mesh in meshes.items()]
             for robot in robots
         ]
+        if is_tracking_task(task):  # the last nodes are those of the followed robot's reference
+            look = {"color": GHOST[:3], "opacity": GHOST[3], "cast_shadow": False}
+            parts = [(f"/world/reference/{body}", mesh) for body, mesh in meshes.items()]
+            self._nodes.append([scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look) for name, mesh in parts])
         self._above, self._arrows = [], []
         if is_velocity_task(task):  # each robot has arrows in a frame above it, which turns with its heading
             thick, nothing = 0.022 * self.length, np.full((2, 2, 3), HIDDEN, dtype=np.float32)
@@ -119,24 +126,26 @@ class Drawing:
             self._above = [scene.add_frame(name, show_axes=False) for name in names]
             self._arrows = [scene.add_arrows(f"{name}/velocities", nothing, colors, **heads) for name in names]
         self._handles = [self._ground, *(node for nodes in self._nodes for node in nodes), *self._above]
-        self._middle = self._base(self.session.followed)
+        self._middle = self._pose(task.physics.qpos, self.session.followed)[0][1]
         self.draw()
 
-    def _base(self, robot: int) -> np.ndarray:
-        """Compute the poses of a robot's bodies, and return the drawn position (3,) of its base, world frame [m]."""
-        self._data.qpos[:] = np.nan_to_num(self._task.physics.qpos[robot].cpu().numpy().astype(float))
+    def _pose(self, qpos: Tensor, robot: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the drawn positions (nbody, 3), world frame [m], and orientations (nbody, 4) of the bodies of a robot, for
+        `qpos` (N, nq). Body 1 is the base.
+        """
+        self._data.qpos[:] = np.nan_to_num(qpos[robot].cpu().numpy().astype(float))
         mujoco.mj_kinematics(self._model, self._data)
-        return np.asarray(self._data.xpos[1]) + self._offsets[robot]
+        return self._data.xpos + self._offsets[robot], self._data.xquat.copy()
 
     def draw(self) -> None:
         """Update the poses, or build the scene anew if the session has another task."""
         if self._task is not self.session.task:
             self.build()
             return
-        poses, bases = [], np.zeros((self._task.num_envs, 3))
-        for robot in range(len(bases)):
-            bases[robot] = self._base(robot)
-            poses.append((self._data.xpos[self._bodies] + self._offsets[robot], self._data.xquat[self._bodies].copy()))
+        poses = [self._pose(self._task.physics.qpos, robot) for robot in range(self._task.num_envs)]
+        bases = np.array([positions[1] for positions, _ in poses])
+        if is_tracking_task(self._task):
+            poses.append(self._pose(self._task.motion.now.qpos, self.session.followed))
         if self.follows:
             away = bases[self.session.followed] - self._middle
             share = 1.0 if np.linalg.norm(away) > CUT else GLIDE
@@ -146,8 +155,8 @@ class Drawing:
             if self._plane:
                 self._ground.position = (*(PERIOD * np.round(self._middle[:2] / PERIOD)), 0.0)
             for nodes, (positions, turns) in zip(self._nodes, poses, strict=True):
-                for node, position, turn in zip(nodes, positions, turns, strict=True):
-                    node.position, node.wxyz = position, turn
+                for node, body in zip(nodes, self._bodies, strict=True):
+                    node.position, node.wxyz = positions[body], turns[body]
             if self._above:
                 self._draw_velocities(bases)
 
