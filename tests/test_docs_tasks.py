@@ -36,7 +36,9 @@ def named(page: str) -> list[tuple[str, str]]:
 
 RANDOMISATION = (ROOT / "docs" / "randomisation.md").read_text(encoding="utf-8")
 TERRAIN = (ROOT / "docs" / "terrain.md").read_text(encoding="utf-8")
+ACTUATORS = (ROOT / "docs" / "actuators.md").read_text(encoding="utf-8")
 BLOCKS = [*named(PAGE), *named(RANDOMISATION)]
+OTHERS = dict([*named(TERRAIN), *named(ACTUATORS)])
 MODULES = {name: text for name, text in BLOCKS if "/" not in name}
 EXCERPTS = [(name, text) for name, text in BLOCKS if "/" in name]
 NETWORKS = (ROOT / "docs" / "networks.md").read_text(encoding="utf-8")
@@ -82,7 +84,7 @@ def run(command: str) -> int:
 
 def lines(name: str) -> int:
     """Return how many lines of a file of the page or of the package are neither blank nor comments."""
-    text = MODULES[name] if name in MODULES else (ROOT / name).read_text(encoding="utf-8")
+    text = (MODULES | OTHERS).get(name) or (ROOT / name).read_text(encoding="utf-8")
     return sum(1 for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
 
 
@@ -136,6 +138,8 @@ def test_the_ground_from_a_picture_is_trained_on(files, capsys):
         ("feel.py", "_obs_foot_contact"),
         ("upright.py", "_terminate_leaning"),
         ("height.py", "_metric_base_height"),
+        ("clearance.py", "_obs_clearance"),
+        ("dance.py", "_reward_motion"),
     ],
 )
 def test_the_term_of_a_module_is_called(files, file, method, capsys):

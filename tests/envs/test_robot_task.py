@@ -28,69 +28,15 @@ from legged.rendering.camera import RobotsCamera, camera_of
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-MODULE = '''
-from dataclasses import dataclass, field
-
-import torch
-
-from legged import register, unit
-from legged.config import RobotConfig
-from legged.config.section import Section
-from legged.envs import RobotTask
-
-
-@dataclass(frozen=True)
-class MotionConfig(Section):
-    """Reference motion of the joints."""
-
-    amplitude: float = 0.2
-    """Largest distance from the default angles [rad]."""
-    period_s: float = 1.0
-    """Period of the motion [s]."""
-
-
-@dataclass(frozen=True)
-class DanceConfig(RobotConfig):
-    """A robot that follows a motion."""
-
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    """Reference motion."""
-
-
-class Dance(RobotTask):
-    Config = DanceConfig
-
-    def make_commands(self):
-        self.reference = torch.zeros_like(self.dof_pos)
-
-    def ask(self):
-        cfg = self.cfg.motion
-        turn = torch.sin(self.episode_length_buf * (6.2832 * self.dt / cfg.period_s)).unsqueeze(1)
-        self.reference.copy_(self.default_dof_pos + cfg.amplitude * turn)
-
-    @unit("rad")
-    def _obs_reference(self):
-        """Reference angle minus default angle, by joint [rad]."""
-        return self.reference - self.default_dof_pos
-
-    @unit("rad^2")
-    def _reward_motion(self):
-        """Squared distance from the reference [rad^2]."""
-        return (self.dof_pos - self.reference).square().sum(dim=1)
-
-
-terms = ["base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "actions", "reference"]
-SETTINGS = {
-    "robot": "anymal_c",
-    "env": {"episode_length_s": 0.4, "num_envs": 4},
-    "rewards": {"scales": {"motion": -1.0, "torques": -1e-5}},
-    "observations": {"groups": {"actor": {"terms": terms, "noise": True}, "critic": {"terms": terms}}},
-}
-register("dance", SETTINGS, Dance)
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "tasks.md").read_text(encoding="utf-8")
+MODULE = (
+    PAGE.partition("# dance.py\n")[2].partition("```")[0]
+    + """
 hills = {"mesh_type": "height_map", "proportions": {"waves": 0.5, "stairs_up": 0.5}, "num_rows": 6, "num_cols": 2}
-register("dance_hills", {**SETTINGS, "terrain": hills}, Dance)
-'''
-ONE = [("env.num_envs", 4), *ENGINE]
+register("dance_hills", {"extends": "dance", "terrain": hills}, Dance)
+"""
+)
+ONE = [("env.num_envs", 4), ("env.episode_length_s", 0.4), *ENGINE]
 
 
 @pytest.fixture
