@@ -420,13 +420,24 @@ def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) 
     for option in ("robot", "command", *AXES, "seconds", "friction", "rmse"):
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
-    result = [Tracker(path, layout).replay() for path, layout in zip(files, layouts, strict=True)]
+    result = [
+        Tracker(tracker, layout).replay()
+        for path, layout in zip(files, layouts, strict=True)
+        for tracker in _trackers(path, layout)
+    ]
     Console(width=130).print(trackers_table(result))
     if args.out is not None:
         make_folder(args.out)
         write_text(args.out / RESULT, json.dumps({"trackers": result}, indent=1))
         print(f"written: {relative(args.out / RESULT)}")
     return 0
+
+
+def _trackers(file: Path, layout: Layout) -> list[Path]:
+    """Return `file`, but the trackers beside it if it is the policy of an export without a motion."""
+    if layout.contract is None or file.name != EXPORTED[0]:
+        return [file]
+    return [file.with_name(name) for name in layout.contract.trackers]
 
 
 def _exported_file(name: str) -> Path | None:
