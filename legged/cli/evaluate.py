@@ -367,7 +367,8 @@ def onnx(args: argparse.Namespace) -> int:
     model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
-    If the layout names a `task`, the files are trackers that hold their motion. The robot then tracks it to the end.
+    If the layout names a `task`, or policy.json describes a policy that tracks motions, the files are trackers, which hold
+    their motion. The robot then tracks it to the end. Of an exported folder, all trackers are measured.
 
     With --vx, --vy or --yaw the errors over a grid of commands are measured, and policies are sorted by training time. With
     --rmse the command also prints the first policy whose velocity RMSE is at most --rmse and whose robot never falls.

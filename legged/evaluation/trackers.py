@@ -52,11 +52,8 @@ class Tracker:
         if (contract := layout.contract) is not None:
             motion, steps = contract.entries["motion"], round(contract.control_dt / contract.sim_dt)
             changes += [(f"motion.{key}", motion.get(key)) for key in ("anchor", "bodies", "extremities")]
-            changes += [
-                ("sim.dt", contract.sim_dt),
-                ("control.decimation", steps),
-                ("control.clip_actions", layout.action_clip),
-            ]
+            changes += [("sim.dt", contract.sim_dt), ("control.decimation", steps)]
+            changes.append(("control.clip_actions", layout.action_clip))
         own = load_robot(cfg.robot).joint_names
         for name in names or ():
             if name not in own:
