@@ -367,7 +367,8 @@ def onnx(args: argparse.Namespace) -> int:
     model, frames, joint order and gains are those of the training. A policy that this package exported has a policy.json next
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
-    If the layout names a `task`, the files are trackers that hold their motion. The robot then tracks it to the end.
+    If the layout names a `task`, or policy.json describes a policy that tracks motions, the files are trackers, which hold
+    their motion. The robot then tracks it to the end. Of an exported folder, all trackers are measured.
 
     With --vx, --vy or --yaw the errors over a grid of commands are measured, and policies are sorted by training time. With
     --rmse the command also prints the first policy whose velocity RMSE is at most --rmse and whose robot never falls.
@@ -420,13 +421,24 @@ def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) 
     for option in ("robot", "command", *AXES, "seconds", "friction", "rmse"):
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
-    result = [Tracker(path, layout).replay() for path, layout in zip(files, layouts, strict=True)]
+    result = [
+        Tracker(tracker, layout).replay()
+        for path, layout in zip(files, layouts, strict=True)
+        for tracker in _trackers(path, layout)
+    ]
     Console(width=130).print(trackers_table(result))
     if args.out is not None:
         make_folder(args.out)
         write_text(args.out / RESULT, json.dumps({"trackers": result}, indent=1))
         print(f"written: {relative(args.out / RESULT)}")
     return 0
+
+
+def _trackers(file: Path, layout: Layout) -> list[Path]:
+    """Return `file`, but the trackers beside it if it is the policy of an export without a motion."""
+    if layout.contract is None or file.name != EXPORTED[0]:
+        return [file]
+    return [file.with_name(name) for name in layout.contract.trackers]
 
 
 def _exported_file(name: str) -> Path | None:

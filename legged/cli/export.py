@@ -7,6 +7,7 @@ import torch
 
 from legged.commandline.arguments import POLICY, policy_overrides, register_given, settle_on
 from legged.commandline.command import sub_command
+from legged.config import override
 from legged.deploy.command_parser import argument
 from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
@@ -14,9 +15,6 @@ from legged.learning.run_folder import checkpoints
 from legged.policies import export as exporting
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import ready_to_write, relative
-
-MEGABYTES = 5.0
-"""Disk space for the exported files of one checkpoint [MiB]."""
 
 
 @sub_command(
@@ -38,6 +36,9 @@ def export(args: argparse.Namespace) -> int:
     policy.onnx and policy.json state the number of iterations, and the time `wall_s` from the start of the training process
     to the checkpoint [s]. `legged evaluate onnx --rmse` finds the first of these policies that walks. To export a single
     checkpoint, use `legged play`.
+
+    A policy that tracks motions has a file policy_<motion>.onnx besides, for each motion. `legged motion` reads the motion
+    in this file, and `legged evaluate onnx` replays it.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:
@@ -49,15 +50,18 @@ def export(args: argparse.Namespace) -> int:
     if not paths:
         raise ConfigError(f"POLICY: {relative(policy.folder)} contains no checkpoint")
     folder = args.out or policy.output("export") / exporting.EXPORTED
-    ready_to_write(folder, MEGABYTES * len(paths))
+    asked = policy_overrides(args)
+    ready_to_write(folder, exporting.megabytes(override(policy.cfg, asked)) * len(paths))
     # An export simulates nothing. A task with one robot in C MuJoCo is built fastest, because it needs no kernels.
-    changes = [*undisturbed(policy.cfg, 1), ("sim.physics", "mujoco"), *policy_overrides(args)]
+    changes = [*undisturbed(policy.cfg, 1), ("sim.physics", "mujoco"), *asked]
     task, act = restore(policy, changes, device, graph=False)
     for path in paths.values():
         training: dict[str, float] = {"iterations": act.load(path)}
         seconds = read_checkpoint(path)["infos"].get("wall_s")
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
-        exporting.export(task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg)
+        exporting.export(
+            task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg, relative(policy.folder)
+        )
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0

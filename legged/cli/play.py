@@ -30,15 +30,15 @@ from legged.play.playground import SETTING, Playground
 from legged.play.viewer import view
 from legged.policies.actor import Actor
 from legged.policies.episodes import for_episodes
-from legged.policies.export import EXPORTED, export
+from legged.policies.export import EXPORTED, export, megabytes
 from legged.policies.restore import TrainedPolicy, policy_of, restore, undisturbed
 from legged.process.headless import HEADLESS
 from legged.process.paths import ready_to_write, relative
 from legged.registry import task_config
 from legged.rendering.camera import window_opens
 
-ROOM_MB = 24.0
-"""Disk space for the film and the exported policy [MiB]."""
+FILM_MB = 19.0
+"""Disk space for the film [MiB]."""
 MOST_ROBOTS = 4096
 """Largest number of robots. More would take minutes to build, and gigabytes."""
 MOST_SHOWN = 9
@@ -79,7 +79,7 @@ def play(args: argparse.Namespace) -> int:
     playground, task, act = _on_ground(args, policy, asked, device, folder)
     print(f"{policy.cfg.task}: {relative(policy.checkpoint)}\nwatch it: {watch_command(args, policy.folder)}")
 
-    differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg)
+    differences = export(task, act.network, folder / EXPORTED, trained=policy.cfg, run=relative(policy.folder))
     for name, difference in differences.items():
         print(f"exported {relative(folder / EXPORTED / name)}, largest difference to the policy {difference:.1e}")
 
@@ -128,7 +128,7 @@ def _on_ground(
     if playground:
         changes += playground.changes(cfg)
         terrain = playground.build(override(cfg, changes))
-    ready_to_write(folder, ROOM_MB)
+    ready_to_write(folder, FILM_MB + megabytes(cfg))
     task, act = restore(policy, changes, device, graph=not args.no_graph, terrain=terrain)
     if playground:
         playground.place(task)

@@ -37,6 +37,9 @@ TOLERANCE = 1e-3
 """Largest difference at which limits count as equal: absolute for joint angles [rad], relative for torques and speeds."""
 DEEPEST, MOST_DIGITS = 20, 18
 """Deepest nesting, and largest number of digits of a whole number, in JSON from files and packets."""
+COMMANDS = ("vx", "vy", "yaw_rate")
+NO_COMMANDS = {"command_ranges": dict.fromkeys(COMMANDS, (0.0, 0.0)), "command_dead_zone": 0.0}
+"""Entries that policy.json lacks if the policy tracks motions."""
 RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "stiffness": ("0 or more", lambda x: x >= 0.0),
     "damping": ("above 0, because damping stops the robot", lambda x: x > 0.0),
@@ -155,6 +158,8 @@ class Contract:
     """Physics step in training [s]. The actuator's delay is a number of these steps."""
     actuator: Mapping[str, Any]
     """Section control.actuator of the training's configuration; empty if the export lacks it."""
+    trackers: tuple[str, ...]
+    """ONNX files beside policy.json with the policy and one motion each; empty for a policy that follows commands."""
     states: Mapping[str, tuple[int, int, int]]
     """Input of the ONNX file -> shape (layers, 1, width) of a hidden state; empty for a policy without memory."""
 
@@ -225,8 +230,9 @@ class Contract:
                 )
 
 
-def read_contract(path: Path) -> Contract:
+def read_contract(path: Path, may_track: bool = False) -> Contract:
     """Return the contract in a policy.json. Check exported files in the same folder against the checksums in policy.json.
+    If `may_track`, the policy may track motions instead of following commands. Its commands are 0.
 
     Raises:
         ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
@@ -236,7 +242,12 @@ def read_contract(path: Path) -> Contract:
         said = plain_json(path.read_bytes())
         if not isinstance(said, dict) or "observation" not in said:
             raise ConfigError(f"{path}: is no policy.json of an export (observation is missing)")
-        if "joint_names" not in said or "command_ranges" not in said:
+        if "motion" in said and not may_track:
+            raise ConfigError(
+                f"{path}: task: '{said.get('task')}' tracks motions; a robot runs policies that follow commands"
+                " (`legged evaluate onnx` replays trackers)"
+            )
+        if "joint_names" not in said or not {"command_ranges", "motion"} & set(said):
             raise ConfigError(f"{path}: task: '{said.get('task')}' is no task of a legged robot that follows commands")
         version = said.get("contract_version")
         if version != CONTRACT_VERSION:
@@ -260,7 +271,8 @@ def read_contract(path: Path) -> Contract:
     return contract
 
 
-def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
+def _contract(path: Path, entries: Mapping[str, Any]) -> Contract:
+    said = {**NO_COMMANDS, **entries} if "motion" in entries else entries
     joints, acted, memory = tuple(said["joint_names"]), said["action_joints"], said["recurrent"] or {"onnx_inputs": ()}
     count, scale = len(joints), said["action_scale"]
 
@@ -289,14 +301,14 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
     for key, pose in (("default_joint_angles", default), ("crouch_joint_angles", crouch)):
         if pose is not None:
             check(key, "within position_limits", (low - TOLERANCE <= pose) & (pose <= high + TOLERANCE), pose)
-    ranges = np.array([said["command_ranges"][name] for name in ("vx", "vy", "yaw_rate")], dtype=float).reshape(3, 2)
+    ranges = np.array([said["command_ranges"][name] for name in COMMANDS], dtype=float).reshape(3, 2)
     right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
     check("command_ranges", "finite, and not above the upper limits", right, ranges[:, 0])
     control_dt, sim_dt = numbers("control_dt"), np.array(said.get("sim_dt", said["control_dt"]), dtype=float)
     check("sim_dt", "above 0, and at most control_dt", (sim_dt > 0.0) & (sim_dt <= control_dt + 1e-9), sim_dt)
     return Contract(
         path=path,
-        entries=said,
+        entries=entries,
         task=str(said["task"]),
         robot=str(said["robot"]),
         imu_body=str(said["imu_frame"]["body"]),
@@ -318,6 +330,7 @@ def _contract(path: Path, said: Mapping[str, Any]) -> Contract:
         control_dt=float(control_dt),
         sim_dt=float(sim_dt),
         actuator=dict(said.get("actuator", {})),
+        trackers=tuple(dict(said["motion"]["trackers"])) if "motion" in said else (),
         states={name: (int(memory["shape"][0]), 1, int(memory["shape"][2])) for name in memory["onnx_inputs"]},
     )
 

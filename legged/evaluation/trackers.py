@@ -1,4 +1,4 @@
-"""Replay of trackers of other projects: ONNX files with inputs `obs` and `time_step` that hold their motion."""
+"""Replay of trackers of this and other projects: ONNX files with inputs `obs` and `time_step` that hold their motion."""
 
 from pathlib import Path
 from typing import Any
@@ -49,6 +49,11 @@ class Tracker:
             ("motion.files", [str(path)]),
             ("control.action_scale", layout.action_scale),
         ]
+        if (contract := layout.contract) is not None:
+            motion, steps = contract.entries["motion"], round(contract.control_dt / contract.sim_dt)
+            changes += [(f"motion.{key}", motion.get(key)) for key in ("anchor", "bodies", "extremities")]
+            changes += [("sim.dt", contract.sim_dt), ("control.decimation", steps)]
+            changes.append(("control.clip_actions", layout.action_clip))
         own = load_robot(cfg.robot).joint_names
         for name in names or ():
             if name not in own:
@@ -66,7 +71,7 @@ class Tracker:
         self._back = order.argsort()
         self._columns = {name: order for name in ("dof_pos", "dof_vel", "actions")}
         self._columns["reference"] = torch.cat([order, order + len(own)])
-        self._terms = layout.observation
+        self._terms, self._clip = layout.observation, layout.observation_clip
         width = self._observe().shape[1]
         asked = next(entry.shape[1] for entry in self._session.get_inputs() if entry.name == "obs")
         if isinstance(asked, int) and asked != width:
@@ -78,7 +83,7 @@ class Tracker:
         for name, scale in self._terms.items():
             values = getattr(self.task, f"_obs_{name}")()
             parts.append(scale * (values[:, self._columns[name]] if name in self._columns else values))
-        return torch.cat(parts, dim=1)
+        return torch.cat(parts, dim=1).clamp(-self._clip, self._clip)
 
     @torch.inference_mode()
     def replay(self) -> dict[str, Any]:

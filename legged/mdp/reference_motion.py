@@ -54,7 +54,7 @@ class ReferenceMotion:
         are the settings of `motion` in the configuration.
         """
         n, device = numbers.num_envs, numbers.device
-        joints = len(skeleton.robot.joint_names)
+        sizes = (len(skeleton.robot.joint_names), len(bodies))
         self._uniform, self._memory = uniform, memory
         tables: list[Tensor] = []
         starts: list[Tensor] = []
@@ -70,8 +70,15 @@ class ReferenceMotion:
             spans.append(torch.full((bins,), (count - 1) / bins))
             last.append(torch.full((count,), first + count - 1))
             first, first_bin = first + count, first_bin + bins
-        self.table = Frames(torch.cat(tables).to(device), joints, len(bodies))
+        self.table = Frames(torch.cat(tables).to(device), *sizes)
         """Frames of all clips, one clip after the other."""
+        self.clips: dict[str, Frames] = {}
+        """Clip -> its frames. If several clips have one name, underscores are added."""
+        for clip, rows in zip(clips, self.table.rows.split([len(clip) for clip in clips]), strict=True):
+            name = clip.name
+            while name in self.clips:
+                name += "_"
+            self.clips[name] = Frames(rows, *sizes)
         self._bin_of, self._last = torch.cat(bin_of).to(device), torch.cat(last).to(device)
         self._starts, self._spans = torch.cat(starts).float().to(device), torch.cat(spans).float().to(device)
         self.frame = torch.zeros(n, dtype=torch.long, device=device)
@@ -81,9 +88,9 @@ class ReferenceMotion:
         self.drawn = torch.zeros_like(self.frame)
         """(N,) rows in which the next episodes begin."""
         width = self.table.rows.shape[1]
-        self.now = Frames(torch.zeros(n, width, device=device), joints, len(bodies))
+        self.now = Frames(torch.zeros(n, width, device=device), *sizes)
         """The frame of each robot."""
-        self.start = Frames(torch.zeros(n, width, device=device), joints, len(bodies))
+        self.start = Frames(torch.zeros(n, width, device=device), *sizes)
         """The frame in which each robot's next episode begins."""
         self.chosen: Tensor | None = None
         """(N,) rows in which the next episodes begin instead of the drawn ones; None outside `MotionTracking.start_at`."""

@@ -20,7 +20,7 @@ ROOT = 7
 READERS = (".csv", ".npz", ".onnx")
 """Endings of the files that can be read."""
 CSV_FPS, ONNX_FPS = 30.0, 50.0
-"""Frames per second of csv and ONNX files, which do not say. Those of csv files may be given."""
+"""Frames per second of csv files and of ONNX files that do not say. Those of csv files may be given."""
 
 
 def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
@@ -81,7 +81,8 @@ def _read_npz(path: Path, skeleton: Skeleton, where: str) -> Clip:
         pos, quat, joint = rows[:, :3], rows[:, 3:ROOT], rows[:, ROOT:]
     else:
         _check_width(rows, count, where)
-        pos, quat = _base_of(arrays, _texts(arrays.get("body_names")), skeleton, where)
+        bodies = _texts(arrays.get("body_names"))
+        pos, quat = _pose_of(skeleton.robot.file.base, arrays, bodies, skeleton, where)
         joint = rows
     return make_clip(path.stem, fps, pos, quat, _ordered(joint, names, skeleton, where), where)
 
@@ -105,8 +106,13 @@ def _read_onnx(path: Path, skeleton: Skeleton, where: str) -> Clip:
         quat = arrays["ref_quat_xyzw"][:, [3, 0, 1, 2]].astype(np.float64)
         pos, quat = skeleton.root_poses("torso_link", arrays["ref_pos_xyz"].astype(np.float64), quat, joint)
     else:
-        pos, quat = _base_of(arrays, listed(path, said, ("body_names",)), skeleton, where)
-    return make_clip(path.stem, ONNX_FPS, pos, quat, joint, where)
+        bodies, base = listed(path, said, ("body_names",)), skeleton.robot.file.base
+        anchor = said.get("anchor_body_name", base)
+        body = anchor if bodies is not None and base not in bodies and anchor in bodies else base
+        pos, quat = _pose_of(body, arrays, bodies, skeleton, where)
+        if body != base:
+            pos, quat = skeleton.root_poses(body, pos.astype(np.float64), quat.astype(np.float64), joint)
+    return make_clip(path.stem, float(said.get("fps", ONNX_FPS)), pos, quat, joint, where)
 
 
 def _tables(graph: Any) -> dict[str, np.ndarray]:
@@ -132,21 +138,20 @@ def _tables(graph: Any) -> dict[str, np.ndarray]:
     return found
 
 
-def _base_of(
-    arrays: Mapping[str, np.ndarray], bodies: Sequence[str] | None, skeleton: Skeleton, where: str
+def _pose_of(
+    body: str, arrays: Mapping[str, np.ndarray], bodies: Sequence[str] | None, skeleton: Skeleton, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the base's positions (T, 3) and quaternions (T, 4), from `body_pos_w` (T, B, 3) and `body_quat_w` (T, B, 4). If
+    """Return a body's positions (T, 3) and quaternions (T, 4), from `body_pos_w` (T, B, 3) and `body_quat_w` (T, B, 4). If
     the `bodies` have no names, the first is the base.
     """
-    base = skeleton.robot.file.base
     for name in ("body_pos_w", "body_quat_w"):
         if name not in arrays:
             raise ConfigError(f"{where}: holds no root pose: there is no '{name}'{suggest(name, arrays, 'arrays')}")
-    if bodies is not None and base not in bodies:
+    if bodies is not None and body not in bodies:
         raise ConfigError(
-            f"{where}: has no body '{base}', the base of {skeleton.robot.name}{suggest(base, bodies, 'bodies')}"
+            f"{where}: has no body '{body}', the base of {skeleton.robot.name}{suggest(body, bodies, 'bodies')}"
         )
-    index = 0 if bodies is None else list(bodies).index(base)
+    index = 0 if bodies is None else list(bodies).index(body)
     return arrays["body_pos_w"][:, index], arrays["body_quat_w"][:, index]
 
 

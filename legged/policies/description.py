@@ -13,6 +13,7 @@ from legged.config.task import TaskConfig
 from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
 from legged.envs.marks import unit_of
+from legged.envs.motion_tracking import MotionTracking
 from legged.mdp.observations import ObservationTerm
 from legged.robots.crouched_pose import crouch
 
@@ -66,6 +67,7 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
         **describe_estimator(task),
         **(describe_robot(task) if is_robot_task(task) else describe_model(task)),
         **(describe_commands(task) if is_velocity_task(task) else {}),
+        **(describe_motions(task) if isinstance(task, MotionTracking) else {}),
     }
 
 
@@ -76,6 +78,27 @@ def describe_commands(task: LeggedRobot) -> dict[str, Any]:
         "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
         "command_dead_zone": task.cfg.commands.small_command,
     }
+
+
+def describe_motions(task: MotionTracking) -> dict[str, Any]:
+    """Return the compared bodies, and the files that hold the policy with one motion each."""
+    motion = task.cfg.motion
+    return {
+        "motion": {
+            "anchor": motion.anchor,
+            "bodies": list(motion.bodies),
+            "extremities": list(motion.extremities),
+            "trackers": {tracker_name(name): len(frames.rows) for name, frames in task.motion.clips.items()},
+            "use": "trackers: file -> number of its frames; its input time_step (1, 1) is the frame that the observation"
+            " shows, from 0; the outputs joint_pos and joint_vel of this frame are the term reference; anchor_pos and"
+            " anchor_ori follow from body_pos_w and body_quat_w of the anchor, world frame, bodies in the order of bodies",
+        }
+    }
+
+
+def tracker_name(clip: str) -> str:
+    """Return the name of the file with the policy and the motion `clip`."""
+    return f"policy_{clip}.onnx"
 
 
 def describe_robot(task: RobotTask) -> dict[str, Any]:

@@ -17,13 +17,18 @@ from torch import Tensor, nn
 
 from legged.config import TaskConfig
 from legged.config.actuator import MOTORS
+from legged.config.tracking import tracks_motions
 from legged.deploy import weights as kinds
 from legged.deploy.contract import CHECKSUMS
 from legged.deploy.weights import Layer, NumpyNetwork, pack
 from legged.envs import BaseTask, is_robot_task
+from legged.envs.motion_tracking import MotionTracking
 from legged.errors import RunError
 from legged.learning.estimator import EstimatingModel
-from legged.policies.description import describe
+from legged.mdp.reference_motion import Frames
+from legged.motion.readers import motion_files
+from legged.policies.description import describe, tracker_name
+from legged.policies.motion_export import metadata_of, run_tracker, tables_of, with_motion
 from legged.process.paths import make_folder, write_bytes, write_text
 
 EXPORTED = "exported"
@@ -33,12 +38,26 @@ CHECKED_SEQUENCE = (100, 3)
 """Numbers of steps and robots with which the export of a recurrent policy is checked."""
 NEW_EPISODES = ((40, 1), (70, 0), (70, 2))
 """Pairs (step, robot): in the check of a recurrent policy, an episode of this robot begins at this step."""
+POLICY_MB, TRACKER_MB = 5.0, 2.0
+"""Disk space for the files of one policy, and for each of its trackers [MiB]."""
 LARGEST_DIFFERENCE = 1e-4
 """Largest allowed difference of a file's actions from the policy's, divided by the larger of 1 and the largest action."""
 
 
+def megabytes(cfg: TaskConfig) -> float:
+    """Return the disk space for the exported files of a policy [MiB].
+
+    Raises:
+        ConfigError: a motion of the task is not found.
+    """
+    if not tracks_motions(cfg):
+        return POLICY_MB
+    clips = motion_files([Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files"))
+    return POLICY_MB + TRACKER_MB * len(clips)
+
+
 class ExportError(RunError):
-    """Failure of an export: the actions of an exported file differ from the policy's."""
+    """Failure of an export: an exported file gives other actions than the policy, or another motion than the task's."""
 
 
 def export(
@@ -47,6 +66,7 @@ def export(
     folder: Path,
     training: Mapping[str, Any] | None = None,
     trained: TaskConfig | None = None,
+    run: str = "",
 ) -> dict[str, float]:
     """Write `policy`, rsl-rl's actor network, to `folder` as policy.pt (TorchScript), policy.onnx and policy.weights (plain
     numbers, legged.deploy.weights); return the largest difference of each file's actions from the policy's.
@@ -56,10 +76,11 @@ def export(
     policy, policy.pt keeps the hidden state, for a batch of 1, until its method `reset` is called; policy.onnx has the hidden
     state as inputs and outputs. policy.onnx and policy.json contain the description and `training`; policy.json also has the
     files' checksums. `trained` is the configuration of the training if it differs from the task's. A learned actuator's
-    network is copied to the folder.
+    network is copied to the folder. For a task that tracks motions, there is a tracker for each motion besides, as
+    legged.policies.motion_export says; `run` is the path of the run in its metadata.
 
     Raises:
-        ExportError: the actions of a file differ from the policy's.
+        ExportError: a file gives other actions than the policy, or another motion than the task's.
         RunError: a file cannot be written.
     """
     metadata = {**describe(task, trained), **(training or {})}
@@ -89,14 +110,21 @@ def export(
     finally:
         policy.to(device)
         policy.reset(hidden_state=hidden)
+    trackers: dict[str, Frames] = {}
+    if isinstance(task, MotionTracking):
+        said = metadata_of(task, run)
+        trackers = {tracker_name(name): frames for name, frames in task.motion.clips.items()}
+        files |= {name: with_motion(files["policy.onnx"], frames, said) for name, frames in trackers.items()}
     found = {
         "policy.pt": _by_script(files["policy.pt"], observations, begins, 1 if policy.is_recurrent else batch),
         "policy.onnx": _by_onnx(files["policy.onnx"], observations, begins, metadata["recurrent"]),
         "policy.weights": _by_weights(files["policy.weights"], observations, begins),
     }
+    found |= {name: _by_tracker(name, files[name], frames, observations) for name, frames in trackers.items()}
     differences = {}
     for name, actions in found.items():
-        difference = float(np.abs(actions - wanted).max() / max(1.0, np.abs(wanted).max()))
+        expected = wanted[:1] if name in trackers else wanted
+        difference = float(np.abs(actions - expected).max() / max(1.0, np.abs(expected).max()))
         if not difference <= LARGEST_DIFFERENCE:
             raise ExportError(f"{name}: differs from the policy by {difference:.1e} (allowed: {LARGEST_DIFFERENCE})")
         differences[name] = difference
@@ -164,6 +192,21 @@ def _by_weights(content: bytes, observations: Tensor, begins: Tensor) -> np.ndar
     network = NumpyNetwork(content)
     network.run(observations[0].numpy())
     return _actions(lambda step: network.run(step.numpy()), lambda new: network.restart(new.numpy()), observations, begins)
+
+
+def _by_tracker(name: str, content: bytes, frames: Frames, observations: Tensor) -> np.ndarray:
+    """Return the actions (1, batch, D) of the tracker `name` for the first observations.
+
+    Raises:
+        ExportError: its frames are not `frames`.
+    """
+    last = len(frames.rows) - 1
+    steps = np.linspace(0, last + 2, observations.shape[1]).round()
+    actions, outputs = run_tracker(content, observations[0], steps)
+    for output, table in tables_of(frames).items():
+        if not np.array_equal(outputs[output], table[np.minimum(steps, last).astype(int)]):
+            raise ExportError(f"{name}: {output} differs from the motion")
+    return actions[None]
 
 
 def _torchscript(policy: Any) -> bytes:

@@ -113,7 +113,7 @@ def read_layout(name: str, where: str) -> Layout:
         known = suggest(name, [file.stem for file in folder.glob("*.yaml")])
         raise ConfigError(f"{where}: there is no layout '{name}', neither as a file nor in this package{known}")
     if path.suffix == ".json":
-        layout = _layout_of(read_contract(path))
+        layout = _layout_of(read_contract(path, may_track=True))
     else:
         data = read_yaml(path)
         if not data.get("observation"):
@@ -152,6 +152,7 @@ def _layout_of(contract: Contract) -> Layout:
         return dict(zip(joints, values.tolist(), strict=True))
 
     return Layout(
+        task=contract.task if contract.trackers else "",
         observation=observation,
         observation_clip=contract.observation_clip,
         joints=joints,

@@ -170,6 +170,12 @@ def mjlab_tracker(robot: Robot, skeleton: Skeleton, clip: Clip) -> Path:
     return tracker(arrays, joint_names=",".join(robot.joint_names), body_names="torso_link,pelvis")
 
 
+def tracker_without_its_base(robot: Robot, skeleton: Skeleton, clip: Clip) -> Path:
+    motion = skeleton.body_motion(clip, ["left_knee_link", "torso_link"])
+    arrays = {"joint_pos": clip.joint_pos, "body_pos_w": motion.pos, "body_quat_w": motion.quat}
+    return tracker(arrays, body_names="left_knee_link,torso_link", anchor_body_name="torso_link")
+
+
 def holosoma_tracker(robot: Robot, skeleton: Skeleton, clip: Clip) -> Path:
     motion = skeleton.body_motion(clip, ["torso_link"])
     arrays = {
@@ -180,7 +186,9 @@ def holosoma_tracker(robot: Robot, skeleton: Skeleton, clip: Clip) -> Path:
     return tracker(arrays, dof_names=str(list(robot.joint_names)).replace("'", '"'))
 
 
-@pytest.mark.parametrize("write", [csv_file, own_file, mjlab_file, holosoma_file, mjlab_tracker, holosoma_tracker])
+@pytest.mark.parametrize(
+    "write", [csv_file, own_file, mjlab_file, holosoma_file, mjlab_tracker, tracker_without_its_base, holosoma_tracker]
+)
 def test_a_file_gives_back_its_clip(robot, skeleton, write):
     clip = wave(robot)
     found = read_clip(write(robot, skeleton, clip), skeleton, csv_fps=50.0)
