@@ -30,6 +30,7 @@ EXACT = {
     "sim.physics": "mujoco",
     "observations.add_noise": False,
     "domain_rand.randomize_friction": False,
+    "domain_rand.ranges": {"joint_offset": [0.0, 0.0], **{f"com_{axis}:torso_link": [0.0, 0.0] for axis in "xyz"}},
     "domain_rand.kicks": {},
     **{f"motion.{name}_noise": [0.0] * 6 for name in ("pose", "velocity")},
     "motion.joint_noise": [0.0, 0.0],
