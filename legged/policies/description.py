@@ -13,7 +13,7 @@ from legged.config.task import TaskConfig
 from legged.deploy.contract import CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
 from legged.envs.marks import unit_of
-from legged.envs.motion_tracking import MotionTracking
+from legged.envs.motion_tracking import MotionTracking, is_tracking_task
 from legged.mdp.observations import ObservationTerm
 from legged.robots.crouched_pose import crouch
 
@@ -67,7 +67,7 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
         **describe_estimator(task),
         **(describe_robot(task) if is_robot_task(task) else describe_model(task)),
         **(describe_commands(task) if is_velocity_task(task) else {}),
-        **(describe_motions(task) if isinstance(task, MotionTracking) else {}),
+        **(describe_motions(task) if is_tracking_task(task) else {}),
     }
 
 

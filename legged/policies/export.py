@@ -22,7 +22,7 @@ from legged.deploy import weights as kinds
 from legged.deploy.contract import CHECKSUMS
 from legged.deploy.weights import Layer, NumpyNetwork, pack
 from legged.envs import BaseTask, is_robot_task
-from legged.envs.motion_tracking import MotionTracking
+from legged.envs.motion_tracking import is_tracking_task
 from legged.errors import RunError
 from legged.learning.estimator import EstimatingModel
 from legged.mdp.reference_motion import Frames
@@ -111,7 +111,7 @@ def export(
         policy.to(device)
         policy.reset(hidden_state=hidden)
     trackers: dict[str, Frames] = {}
-    if isinstance(task, MotionTracking):
+    if is_tracking_task(task):
         said = metadata_of(task, run)
         trackers = {tracker_name(name): frames for name, frames in task.motion.clips.items()}
         files |= {name: with_motion(files["policy.onnx"], frames, said) for name, frames in trackers.items()}

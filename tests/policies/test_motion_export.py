@@ -86,7 +86,7 @@ def from_the_beginning(clip: str, act, **settings) -> dict[str, float]:
 
 
 def frame_of(session: onnxruntime.InferenceSession, step: float) -> dict[str, np.ndarray]:
-    """What a tracker says of a frame."""
+    """Outputs of a tracker for a frame."""
     width = session.get_inputs()[0].shape[1]
     given = {"obs": np.zeros((1, width), dtype=np.float32), "time_step": np.array([[step]], dtype=np.float32)}
     return dict(zip(OUTPUTS, session.run([*OUTPUTS], given), strict=True))
@@ -183,7 +183,7 @@ def test_the_motion_is_read_back(folder, capsys):
 
 @pytest.mark.slow
 def test_a_replay_does_what_the_policy_does(runner, folder, capsys):
-    """Of the folder, both trackers are replayed, each like the policy in the task with this motion alone."""
+    """Both trackers of the folder are replayed. Each gives the errors of the policy in a task with this motion alone."""
     assert commands.main(["evaluate", "onnx", str(folder), "--out", "."]) == 0
     rows = json.loads(Path("onnx.json").read_text())["trackers"]
     assert [Path(row["file"]).name for row in rows] == ["policy_squat.onnx", "policy_kick.onnx"]

@@ -194,8 +194,9 @@ class StressedTask(LeggedRobot):
         given |= {"friction": self._frictions(), "joint_offset": self.zero_offset}
         given = {name: values for name, values in given.items() if name in self.cfg.domain_rand.ranges}
         self.control.vary(given)
-        for name in (name for name in given if FIELDS[name].changes):
-            self.physics.randomize(name, given[name])
+        for name, values in given.items():
+            if FIELDS[name].changes:
+                self.physics.randomize(name, values)
         self.reset()
 
     def _per_robot(self, name: str) -> Tensor:
