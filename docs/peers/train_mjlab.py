@@ -1,10 +1,12 @@
-"""Trains a velocity task of mjlab as its authors set it up, and writes the layout that `legged evaluate onnx` judges it by.
+"""Trains a task of mjlab as its authors set it up, and writes the layout that `legged evaluate onnx` judges it by.
 
     python docs/peers/train_mjlab.py Mjlab-Velocity-Flat-Unitree-Go1 --out peers/mjlab_go1 --iterations 500 --every 25
+    python docs/peers/train_mjlab.py Mjlab-Tracking-Flat-Unitree-G1 --motion walk.npz --out peers/mjlab_walk --seconds 600
 
 Runs in an environment with mjlab 1.6, not with this package. Writes into --out: an ONNX file every so many iterations, whose
 metadata have `wall_s`, the seconds since this process began less those spent on such files, and `iterations`; layout.yaml,
-how the policy sees and drives the robot; robot.xml, its model with actuators; and training.json with steps per second.
+how the policy sees and drives the robot; robot.xml, its model with actuators; and training.json with steps per second. The
+ONNX files of a tracking task hold the motion; for them, the layout is `mjlab_tracker` of this package.
 `--resume` goes on from the newest checkpoint in --out, with its `wall_s`: building the task a second time is not counted.
 """
 
@@ -36,7 +38,7 @@ import yaml  # noqa: E402
 from mjlab.entity import Entity  # noqa: E402
 from mjlab.envs import ManagerBasedRlEnv  # noqa: E402
 from mjlab.rl import MjlabOnPolicyRunner, RslRlVecEnvWrapper  # noqa: E402
-from mjlab.tasks.registry import load_env_cfg, load_rl_cfg  # noqa: E402
+from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls  # noqa: E402
 from mjlab.utils.torch import configure_torch_backends  # noqa: E402
 
 TERMS = {
@@ -57,8 +59,8 @@ class TimeIsUp(Exception):
     """The training has had its time."""
 
 
-class TimedRunner(MjlabOnPolicyRunner):
-    """mjlab's runner; each checkpoint is an ONNX file too, that says when it was written."""
+class Timed(MjlabOnPolicyRunner):
+    """Part of a runner of mjlab; each checkpoint is an ONNX file too, that says when it was written."""
 
     folder: Path
     seconds: float
@@ -74,14 +76,20 @@ class TimedRunner(MjlabOnPolicyRunner):
         Raises:
             TimeIsUp: the training has had its time.
         """
-        super().save(path, infos)  # waits for the device
+        if self.device != "cpu":
+            torch.cuda.synchronize()
         before = time.perf_counter()
         wall_s = before - self.began_s - self.exporting_s
+        super().save(path, infos)
         done = self.current_learning_iteration + 1
         name = f"policy_{done:05d}.onnx"
-        self.export_policy_to_onnx(str(self.folder), name)
-        model = onnx.load(self.folder / name)
-        onnx.helper.set_model_props(model, {"wall_s": repr(wall_s), "iterations": str(done)})
+        written = self.folder / f"{self.folder.name}.onnx"  # by runners of tracking tasks, with its metadata
+        if not written.is_file():
+            self.export_policy_to_onnx(str(self.folder), name)
+            written = self.folder / name
+        model = onnx.load(written)
+        for key, value in {"wall_s": repr(wall_s), "iterations": str(done)}.items():
+            model.metadata_props.add(key=key, value=value)
         onnx.save(model, self.folder / name)
         if not self.written or self.written[-1]["iterations"] != done:  # the last one is written twice
             self.written.append({"file": name, "iterations": done, "wall_s": wall_s})
@@ -109,6 +117,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("task")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--motion", type=Path, help="npz file in mjlab's format; for a tracking task")
     parser.add_argument("--iterations", type=int, help="mjlab's own number by default")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="end at the first checkpoint after this time")
     parser.add_argument("--resume", action="store_true", help="go on from the newest checkpoint in --out")
@@ -117,18 +126,23 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
     args = parser.parse_args()
+    args.out = args.out.resolve()
     args.out.mkdir(parents=True, exist_ok=True)
     configure_torch_backends()
     cfg, learning = load_env_cfg(args.task), load_rl_cfg(args.task)
     cfg.scene.num_envs = args.num_envs
     cfg.seed = learning.seed = args.seed
     learning.logger, learning.upload_model, learning.save_interval = "tensorboard", False, args.every
+    if args.motion is not None:
+        cfg.commands["motion"].motion_file = str(args.motion)
     write_model(Entity(cfg.scene.entities["robot"]).spec, args.out / "robot.xml")
     task = ManagerBasedRlEnv(cfg=cfg, device=args.device)
-    layout = layout_of(task, cfg, learning.clip_actions)
-    (args.out / "layout.yaml").write_text(yaml.safe_dump(layout, sort_keys=False))
+    if args.motion is None:
+        layout = layout_of(task, cfg, learning.clip_actions)
+        (args.out / "layout.yaml").write_text(yaml.safe_dump(layout, sort_keys=False))
     env = RslRlVecEnvWrapper(task, clip_actions=learning.clip_actions)
-    runner = TimedRunner(env, asdict(learning), str(args.out), args.device)
+    own = load_runner_cls(args.task) or MjlabOnPolicyRunner
+    runner = type("TimedRunner", (Timed, own), {})(env, asdict(learning), str(args.out), args.device)
     runner.folder, runner.seconds, runner.written = args.out, args.seconds, []
     if args.resume:
         runner.resume()

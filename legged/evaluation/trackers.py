@@ -72,6 +72,7 @@ class Tracker:
         self._columns = {name: order for name in ("dof_pos", "dof_vel", "actions")}
         self._columns["reference"] = torch.cat([order, order + len(own)])
         self._terms, self._clip = layout.observation, layout.observation_clip
+        self._velocity_point = torch.tensor([layout.velocity_point])
         width = self._observe().shape[1]
         asked = next(entry.shape[1] for entry in self._session.get_inputs() if entry.name == "obs")
         if isinstance(asked, int) and asked != width:
@@ -82,6 +83,8 @@ class Tracker:
         parts = []
         for name, scale in self._terms.items():
             values = getattr(self.task, f"_obs_{name}")()
+            if name == "base_lin_vel":
+                values = values + torch.linalg.cross(self.task.base_ang_vel, self._velocity_point)
             parts.append(scale * (values[:, self._columns[name]] if name in self._columns else values))
         return torch.cat(parts, dim=1).clamp(-self._clip, self._clip)
 

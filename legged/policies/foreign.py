@@ -41,7 +41,7 @@ TERMS = {
 OF_TRACKERS = ("reference", "anchor_pos", "anchor_ori")
 """Terms that only trackers observe; `OF_WALKERS` are those that trackers do not observe."""
 OF_WALKERS = ("command_xy", "command_yaw", "phase_sin", "phase_cos")
-OF_TRACKER_LAYOUTS = ("task", "observation", "action_scale")
+OF_TRACKER_LAYOUTS = ("task", "observation", "action_scale", "velocity_point")
 """Settings of a tracker's layout. The others come from its task and its file."""
 COMMANDS = ("command_xy", "command_yaw")
 """Terms of a layout for the two parts of the term `commands` of policy.json: its first two columns, and its third column."""
