@@ -25,8 +25,9 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):
         spec.joint(name).armature = armature
+    shapes = robot.colliding(self_collisions)
     for geom in spec.geoms:
-        if geom.name in robot.shape_names:
+        if geom.name in shapes:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
             if geom.priority < 1:  # without priority, MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
