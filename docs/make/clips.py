@@ -27,6 +27,9 @@ from legged.robots.robot import load_robot
 FPS = 50.0
 SETTLE_S, RECORDED_S = 0.5, 6.0
 """Time before a recording's first frame, and its length [s]."""
+ARMS_OUT = 0.25
+"""Angle by which the arms of the turn are held further out than the policy, which was trained without self-collisions, holds
+them. Otherwise a hand is up to 15 mm inside a hip [rad]."""
 FEET = ("left_ankle_roll_link", "right_ankle_roll_link")
 FORWARD = 0.035
 """A centre of mass this far in front of the ankles is above the middle of the soles [m]."""
@@ -64,7 +67,7 @@ def _main(argv: list[str] | None) -> int:
     skeleton = Skeleton(robot)
     makers: dict[str, Callable[[], Clip]] = {
         "walk": lambda: recorded("walk", (0.6, 0.0, 0.0)),
-        "turn": lambda: recorded("turn", (0.0, 0.0, 0.6)),
+        "turn": lambda: recorded("turn", (0.0, 0.0, -0.5), ARMS_OUT),
         "squat": lambda: squat(skeleton),
         "kick": lambda: kick(skeleton),
     }
@@ -79,8 +82,10 @@ def _main(argv: list[str] | None) -> int:
     return 0
 
 
-def recorded(name: str, command: tuple[float, float, float]) -> Clip:
-    """Return a clip of the policy `g1_flat` that follows a velocity command [m/s, m/s, rad/s]."""
+def recorded(name: str, command: tuple[float, float, float], arms_out: float = 0.0) -> Clip:
+    """Return a clip of the policy `g1_flat` that follows a velocity command [m/s, m/s, rad/s], with its arms further out by
+    `arms_out` [rad].
+    """
     policy = policy_of(str(data_folder("resources") / "policies" / "g1_flat"), None)
     changes = (("env.episode_length_s", SETTLE_S + RECORDED_S + 0.1), ("sim.physics", "mujoco"))
     episodes, _ = roll_out(policy, Wish(1, 1, command=command, changes=changes), torch.device("cpu"))
@@ -88,7 +93,8 @@ def recorded(name: str, command: tuple[float, float, float]) -> Clip:
     first = round(SETTLE_S * FPS)
     qpos = episodes.of(0)["qpos"][first : first + round(RECORDED_S * FPS) + 1].astype(np.float64)
     low, high = robot.dof_pos_limits.T
-    joints = qpos[:, list(robot.qpos_columns)].clip(low, high)  # the engine's limits are soft
+    outward = [arms_out * (1.0 if "left" in joint else -1.0) * ("shoulder_roll" in joint) for joint in robot.joint_names]
+    joints = (qpos[:, list(robot.qpos_columns)] + outward).clip(low, high)  # the engine's limits are soft
     start = np.array([*qpos[0, :2], 0.0])
     return make_clip(name, FPS, qpos[:, :3] - start, qpos[:, 3:7], joints, name)
 

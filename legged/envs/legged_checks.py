@@ -119,8 +119,8 @@ def check_mirrored_draw(cfg: RobotConfig, robot: Robot, name: str) -> None:
 
 
 def check_robot(cfg: RobotConfig, robot: Robot) -> None:
-    """Check that passive joints are observed only if the robot has some, that the lightest base that can be drawn has a
-    positive mass, and that the height scan fits in memory.
+    """Check that passive joints are observed only if the robot has some, that self-collisions are punished only if they are
+    simulated, that the lightest base that can be drawn has a positive mass, and that the height scan fits in memory.
 
     Raises:
         ConfigError: one of these is not so.
@@ -130,6 +130,9 @@ def check_robot(cfg: RobotConfig, robot: Robot) -> None:
             if term in ("passive_pos", "passive_vel") and (robot.passive is None or not robot.passive.names):
                 text = f"{term}: '{robot.name}' has no passive hinges or slides (passive_joints)"
                 raise cfg.origins.error(path_of_terms(cfg, group), text)
+    if cfg.rewards.scales.get("self_collision") and not cfg.sim.self_collisions:
+        text = "shapes of the robot only collide with each other with sim.self_collisions=true, got false"
+        raise cfg.origins.error("rewards.scales.self_collision", text)
     mass, lowest = robot.base_mass, cfg.domain_rand.added_mass_range[0]
     if cfg.domain_rand.randomize_base_mass and mass + lowest <= 0.0:
         text = f"the base of '{robot.name}' weighs {mass:.4g} kg, so the lowest added mass must be above {-mass:.4g}"

@@ -2,6 +2,7 @@
 adds commands. Terms of every robot task are in robot_terms.py.
 """
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeGuard
 
 import torch
@@ -21,9 +22,9 @@ from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
-from legged.mdp.sensors import HeightScan, Sensor
+from legged.mdp.sensors import ContactForces, HeightScan, Sensor
 from legged.mdp.terrain_curriculum import TerrainCurriculum
-from legged.physics import RobotScene, Scene
+from legged.physics import ContactGroups, RobotScene, Scene
 from legged.robots.robot import Robot, load_robot
 from legged.terrain import Terrain
 
@@ -70,14 +71,29 @@ class RobotTask(RobotTerms, BaseTask):
         """Return the robot on its ground."""
         self.robot: Robot = with_rotors(load_robot(self.cfg.robot), self.cfg.control.actuator)
         self.terrain = self.terrain or self.make_terrain()
-        return RobotScene(self.robot, self.terrain)
+        on, where, groups = self.cfg.sim.self_collisions, f"{type(self).__name__}.contact_groups", self.contact_groups()
+        watched = {
+            name: ContactGroups.of(self.robot, pair, self.cfg.control.decimation, on, f"{where}: {name}")
+            for name, pair in groups.items()
+        }
+        return RobotScene(self.robot, self.terrain, watched)
+
+    def contact_groups(self) -> dict[str, tuple[Sequence[str], Sequence[str]]]:
+        """Hook: return name -> two groups of shapes, given as patterns of shapes or as `GROUND`. The sensor of this name, a
+        `ContactForces`, measures the forces of contacts between both groups.
+        """
+        if not self.cfg.rewards.scales.get("self_collision"):
+            return {}
+        shapes = tuple(self.robot.colliding(self.cfg.sim.self_collisions))
+        return {"self_collision": (shapes, shapes)}
 
     def make_sensors(self) -> dict[str, Sensor]:
-        """Return the height scan. A subclass may add sensors."""
+        """Return the height scan and the sensors of `contact_groups`. A subclass may add sensors."""
         state = self.physics.robot_state
         assert state is not None
         self.height_scan = HeightScan(self.cfg.terrain, self.terrain, (state.base_pos, state.base_quat), self.kernels)
-        return {**super().make_sensors(), "height_scan": self.height_scan}
+        forces = {name: ContactForces(measured) for name, measured in self.physics.group_forces.items()}
+        return {**super().make_sensors(), "height_scan": self.height_scan, **forces}
 
     def make_terrain(self) -> Terrain | None:
         """Hook: return the configured terrain; None for a plane. A subclass may return another terrain."""

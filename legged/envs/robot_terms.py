@@ -13,7 +13,7 @@ from legged.math import squared_difference
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
 from legged.mdp.mirror_images import MirrorKind
-from legged.mdp.sensors.height_scan import HeightScan
+from legged.mdp.sensors import ContactForces, HeightScan, Sensor
 from legged.physics import Physics
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
@@ -25,6 +25,9 @@ threshold is 1 N, or 1 % of the weight of a robot that weighs less than 100 N.
 """
 PENALISED_FORCE = 0.1
 """A contact of a penalised shape is a collision if its force exceeds this multiple of the feet's contact threshold."""
+
+SELF_COLLISION_FORCE = 10.0
+"""A contact of the robot with itself is a collision if its force exceeds this multiple of the feet's contact threshold."""
 
 
 class RobotTerms:
@@ -106,6 +109,8 @@ class RobotTerms:
     """Ground heights in the world frame [m]: `measured_heights` (N, P) around each robot, `height_scan.ground` (N,) under
     each robot."""
     measured_heights: Tensor
+    sensors: dict[str, Sensor]
+    """Sensors by name."""
     terminated_buf: Tensor
     """(N,) True if the episode ends now in a failure."""
     termination_indices: Tensor
@@ -246,6 +251,16 @@ class RobotTerms:
         return (self.contact_forces[:, self.penalised_indices].norm(dim=2) > self._force(PENALISED_FORCE)).sum(
             dim=1, dtype=torch.float32
         )
+
+    @concurrent
+    @unit("1")
+    def _reward_self_collision(self) -> Tensor:
+        """Number of physics steps in the control step in which a contact between two shapes of the robot had a large force:
+        more than 10 N, or 10 % of the weight of a robot that weighs less than 100 N.
+        """
+        forces = self.sensors["self_collision"]
+        assert isinstance(forces, ContactForces)
+        return forces.steps_above(self._force(SELF_COLLISION_FORCE))
 
     @unit("1")
     def _reward_termination(self) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from legged.config.world import SimConfig
 from legged.errors import ConfigError, suggest
 from legged.physics.base import Physics
+from legged.physics.contact_groups import GROUND, ContactGroups
 from legged.physics.fields import FIELDS, NEWTONS_FIELDS, row_counts
 from legged.physics.quantities import check_quantities
 from legged.physics.randomized_model import check_ranges
@@ -18,7 +19,9 @@ from legged.process.startup import importing
 
 __all__ = [
     "FIELDS",
+    "GROUND",
     "MANY_WORLDS",
+    "ContactGroups",
     "ModelScene",
     "Physics",
     "RobotScene",

@@ -37,6 +37,9 @@ class Physics(ABC):
     ctrl: Tensor
     """(N, nu) float32 controls, in the unit of the model's actuators ([N m] for motors of gear 1). The task writes them in
     place before a step; they keep their values until written again."""
+    group_forces: dict[str, Tensor]
+    """Name of two groups of shapes (`Scene.contact_groups`) -> (N, K) largest force [N] of a contact between the groups in
+    each of the last K physics steps, the last step first; zero after a reset. It is up to date after `step`."""
     forces: Tensor | None = None
     """(N, B, 6) external forces [N] and torques [N m] at the centres of mass of the B bodies of `model`, in the world frame.
     The task writes them in place; they keep their values until written again or until `write` resets the world. None if the
@@ -131,6 +134,11 @@ class Physics(ABC):
         """Return the arrays (N, ...) that, with `ctrl`, determine the following steps. Outputs of the last step are included.
         After `load_state` with copies of these arrays, the engine repeats the same steps; on a CPU they are bit-identical.
         """
+
+    def _clear_groups(self, mask: Tensor) -> None:
+        """Set `group_forces` to zero in the worlds of `mask` (N,)."""
+        for forces in self.group_forces.values():
+            forces.masked_fill_(mask.view(-1, 1), 0.0)
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
         """Set all worlds to the state `saved` (a copy of `state_tensors`), and call `refresh`.

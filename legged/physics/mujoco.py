@@ -11,6 +11,7 @@ from torch import Tensor
 from legged.config.world import SimConfig
 from legged.math import quat_rotate_inverse
 from legged.physics.base import Physics
+from legged.physics.contact_groups import sensor_columns, zero_forces
 from legged.physics.engine_warnings import keep_out_of_files
 from legged.physics.feet import FeetKinematics
 from legged.physics.fields import FIELDS, GRAVITY, changed_arrays
@@ -77,6 +78,9 @@ class MujocoPhysics(Physics):
             self.robot_state = robot_state(self.qpos, self.qvel, scene.robot)
             self._joints = DrivenJoints(self.qpos, self.qvel, self.robot_state, scene.robot)
             self._robot = _RobotReader(self.batch, self.robot_state, scene.robot, self.qpos, self.qvel)
+        self.group_forces = zero_forces(scene.contact_groups, num_envs, device)
+        self._group_columns = {name: sensor_columns(self.model, name) for name in self.group_forces}
+        self._sensors = self.batch.bind("sensordata")
         self._reader = _QuantityReader(self.batch, quantities)
         self._quantities = self._reader.values
         self._warnings = self.batch.warning[:, OVERFLOW, 1].copy()
@@ -89,6 +93,10 @@ class MujocoPhysics(Physics):
         self.batch.step()
         if self._robot is not None:
             self._robot.stepped = True
+        for name, forces in self.group_forces.items():
+            largest = np.linalg.norm(self._sensors[:, self._group_columns[name]], axis=2).max(axis=1)
+            forces[:, 1:] = forces[:, :-1].clone()
+            forces[:, 0] = torch.from_numpy(largest)
         self._reader.note_step()
         self._read()
 
@@ -115,6 +123,7 @@ class MujocoPhysics(Physics):
             cleared.masked_fill_(rows, 0.0)
         if self.forces is not None:
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
+        self._clear_groups(mask)
         if self.robot_state is not None:
             self.robot_state.contact_forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
         self._reader.note_write(mask)
@@ -162,7 +171,8 @@ class MujocoPhysics(Physics):
             state["contact_forces"] = self.robot_state.contact_forces
         if self.forces is not None:
             state["forces"] = self.forces
-        return {**state, **self._reader.of_last_step}
+        groups = {f"forces_{name}": forces for name, forces in self.group_forces.items()}
+        return {**state, **self._reader.of_last_step, **groups}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
         self._reader.stale.fill_(True)

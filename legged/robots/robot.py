@@ -18,7 +18,7 @@ from legged.robots.mirror import Mirror
 from legged.robots.passive_joints import PassiveJoints, default_qpos
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot_model import aimless_shapes, base_mass, check_model, driven_joints, passive_joints, read_model
-from legged.robots.shapes import Shapes
+from legged.robots.shapes import Shapes, self_collision_shapes
 from legged.robots.stance import standing_height, swinging_joints
 
 SLACK = 1e-3
@@ -49,6 +49,8 @@ class RobotFile:
     """Patterns of the shapes whose contacts the `collision` reward counts."""
     terminate_after_contacts_on: tuple[str, ...] = ()
     """Patterns of the shapes whose contact ends the episode."""
+    self_collision_shapes: tuple[str, ...] = ()
+    """Patterns of shapes that collide only with `sim.self_collisions`. In the model, their contype and conaffinity are 0."""
     passive_joints: tuple[str, ...] = field(default=(), metadata=TERMS)
     """Patterns of the joints without a motor, e.g. of springs and closed loops. Slides and balls are allowed."""
     wheels: tuple[str, ...] = field(default=(), metadata=TERMS)
@@ -98,7 +100,11 @@ class Robot:
     positions of the passive joints.
     """
     shape_names: tuple[str, ...]
-    """Names of the S collision shapes, in the order of the model."""
+    """Names of the S collision shapes, in the order of the model. `shape_bodies` are the names of their bodies."""
+    shape_bodies: tuple[str, ...]
+    self_collision_shapes: Mapping[str, str]
+    """Name of each shape that collides only with `sim.self_collisions` -> name of its body. No contact force is computed for
+    it, and it is not among the S shapes."""
     contact_of_shape: tuple[int, ...]
     """(S,) index of the contact that each shape belongs to."""
     contact_names: tuple[str, ...]
@@ -136,6 +142,11 @@ class Robot:
     def without_wheels(self) -> tuple[int, ...]:
         """Indices of the joints that do not turn wheels."""
         return tuple(int(i) for i in np.flatnonzero(~self.wheels))
+
+    def colliding(self, self_collisions: bool) -> dict[str, str]:
+        """Return name -> body of the shapes that collide with or without `sim.self_collisions`."""
+        always = dict(zip(self.shape_names, self.shape_bodies, strict=True))
+        return always | dict(self.self_collision_shapes) if self_collisions else always
 
     def each(self, value: Any, where: str) -> np.ndarray:
         """Return a number for each joint (D,). `value` is one number for all, or maps patterns of joint names to numbers.
@@ -216,6 +227,8 @@ def load_robot(name: str, where: str = "robot") -> Robot:
         passive=passive,
         default_qpos=qpos,
         shape_names=shapes.names,
+        shape_bodies=shapes.bodies,
+        self_collision_shapes=self_collision_shapes(model, file.self_collision_shapes, f"{path}: self_collision_shapes"),
         contact_of_shape=shapes.contact,
         contact_names=shapes.contact_names,
         feet_shapes=shapes.feet_shapes,

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
+import numpy as np
 
 from legged.robots.patterns import match_names
 
@@ -72,6 +73,16 @@ def match_shapes(patterns: Sequence[str], names: Sequence[str], bodies: Sequence
         by_body = bool(pattern) and not any(pattern in name for name in names) and any(pattern in body for body in bodies)
         found.update(match_names([pattern], bodies if by_body else names, where))
     return tuple(sorted(found))
+
+
+def self_collision_shapes(model: mujoco.MjModel, patterns: Sequence[str], where: str) -> dict[str, str]:
+    """Return name -> body of the named shapes that don't collide in the model's file and that `patterns` match. Raises the
+    error of `match_shapes`.
+    """
+    still = np.flatnonzero((model.geom_contype == 0) & (model.geom_conaffinity == 0))
+    geoms = [model.geom(int(i)) for i in still if model.geom(int(i)).name]
+    names, bodies = tuple(g.name for g in geoms), tuple(model.body(g.bodyid[0]).name for g in geoms)
+    return {names[i]: bodies[i] for i in match_shapes(patterns, names, bodies, where)}
 
 
 def _common_name(names: Sequence[str], body: str) -> str:

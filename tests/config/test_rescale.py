@@ -86,7 +86,8 @@ def test_rewards_whose_unit_is_one():
     """A reward that measures something physical must have its number rescaled, and these do not."""
     counted = {name for name in LeggedRobot.terms("_reward_") if unit_of(getattr(LeggedRobot, f"_reward_{name}")) == "1"}
     tracking = {"tracking_lin_vel", "tracking_ang_vel"}
-    assert counted == tracking | {"orientation", "action_rate", "collision", "termination", "stumble", "no_fly"}
+    counts = {"collision", "self_collision", "termination", "stumble", "no_fly"}
+    assert counted == tracking | counts | {"orientation", "action_rate"}
 
 
 @pytest.mark.parametrize("text", ["metres", "", "m^", "[m]", 3])

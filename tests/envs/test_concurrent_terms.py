@@ -274,5 +274,6 @@ def test_built_in_terms_run_early_but_the_one_that_reads_which_episodes_end(kind
 
 def test_built_in_terms_with_the_mark_read_nothing_that_is_not_settled():
     scales = {name: 1.0 for name in LeggedRobot.terms("_reward_")}
-    config = small_config(("rewards.scales", scales), ("terminations.min_base_height", 0.1), ("terminations.max_tilt", 1.0))
+    limits = (("terminations.min_base_height", 0.1), ("terminations.max_tilt", 1.0))
+    config = small_config(("rewards.scales", scales), *limits, ("sim.self_collisions", True))
     assert set(LeggedRobot(config).rewards.names) == set(scales)

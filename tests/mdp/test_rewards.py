@@ -37,6 +37,7 @@ TERMS = [
     "feet_slide",
     "feet_clearance",
     "posture",
+    "self_collision",
 ]
 
 
@@ -50,6 +51,8 @@ def built():
         ("rewards.soft_dof_pos_limit", 0.9),
         ("rewards.soft_dof_vel_limit", 0.5),
         ("rewards.soft_torque_limit", 0.75),
+        ("rewards.scales.self_collision", -1.0),
+        ("sim.self_collisions", True),
         num_envs=2,
     )
 
@@ -64,6 +67,7 @@ def task(built):
         built.last_actions,
         built.commands,
         built.contact_forces,
+        built.sensors["self_collision"].forces,
         built.contacts.last_air_time,
         built.contacts.air_time,
         built.feet_pos,
@@ -235,6 +239,15 @@ def test_stand_still_sums_joint_deviations_while_no_motion_is_commanded(task):
     task.dof_pos[:, :2] += torch.tensor([0.1, -0.2])
     task.is_moving.copy_(torch.tensor([False, True]))
     assert value(task, "stand_still") == near(0.3, 0.0)
+
+
+def test_self_collision_counts_physics_steps_with_a_strong_contact(task):
+    forces = task.sensors["self_collision"].forces
+    assert forces.shape == (2, task.cfg.control.decimation)
+    forces[0, :3] = torch.tensor([10.1, 9.9, 500.0])
+    forces[1, 1] = 10.0  # not above
+    assert value(task, "self_collision") == near(2.0, 0.0)
+    assert task.sensors["self_collision"].largest.tolist() == [500.0, 10.0]
 
 
 def test_feet_contact_forces_measures_the_excess_over_the_allowed_force(task):

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from legged.config.world import SimConfig
 from legged.errors import suggest
+from legged.physics.contact_groups import GROUND, zero_forces
 from legged.physics.fields import NEWTONS_FIELDS
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
@@ -17,6 +18,7 @@ from legged.physics.robot_state import robot_state
 from legged.physics.scene import RobotScene
 from legged.physics.warp.compile import compile_ahead
 from legged.physics.warp.physics import WarpPhysics
+from legged.robots.reserved_names import FLOOR
 
 
 class NewtonPhysics(WarpPhysics):
@@ -50,6 +52,7 @@ class NewtonPhysics(WarpPhysics):
         self.qvel = torch.zeros(num_envs, 6 + robot.num_dof, device=device)
         self.robot_state = robot_state(self.qpos, self.qvel, robot)
         self._quantities = {}
+        self.group_forces = zero_forces(scene.contact_groups, num_envs, device)
         self._randomized, self._scene = tuple(randomized), scene
         self._fields: SolverFields | None = None
         """Arrays of the MuJoCo solver that fields change. None if only friction and the base's mass are randomised, and only
@@ -62,13 +65,16 @@ class NewtonPhysics(WarpPhysics):
             self._simulation = Simulation(robot, sim, num_envs, scene.terrain, self._wp_device)
             task = tuple(wp.from_torch(tensor) for tensor in (self.qpos, self.qvel, self.ctrl))
             self._state_io = NewtonStateIO(self._simulation, task, self.overflowed, self.model, robot, self.robot_state)
+            shapes = [GROUND if label == FLOOR else label.rpartition("/")[2] for label in self._simulation.model.shape_label]
+            self._state_io.watch(shapes, scene.contact_groups, self.group_forces)
             if set(randomized) - set(NEWTONS_FIELDS):
                 self._state_io.motors = self._solvers_fields()
             if self.forces is not None:
                 self._simulation.push_with(self.forces, self.model)
             self._state_io.read()
             start = self.qpos.clone()
-        launches = (self._state_io.kinematics, self._state_io.contact_forces, *launches)
+        own = self._state_io
+        launches = (own.kinematics, own.contact_forces, own.measure_groups, *launches)
         self.compiled = compile_ahead(self._wp_device, (self._step, self._put, self._forget, *launches))
         if self._wp_device.is_cpu:
             self._advance = self._record_step()
@@ -101,6 +107,7 @@ class NewtonPhysics(WarpPhysics):
             self._forget()
             self._state_io.write(mask, qpos, qvel)
             self._put()
+        self._clear_groups(mask)
         if self.forces is not None:
             self.forces.masked_fill_(mask.view(-1, 1, 1), 0.0)
 

@@ -15,6 +15,7 @@ import warp as wp
 from legged.physics.newton.fields import SolverFields
 from legged.physics.newton.simulation import Simulation
 from legged.physics.robot_state import RobotState
+from legged.physics.warp.contact_forces import between
 from legged.physics.warp.state_io import EngineArrays, RobotStateIO, rotate, rotate_inverse
 from legged.robots.robot import Robot
 
@@ -130,6 +131,27 @@ def add_shape_forces(
 
 
 @wp.kernel
+def find_largest_force(
+    count: wp.array[int],
+    shape0: wp.array[int],
+    shape1: wp.array[int],
+    force: wp.array[wp.spatial_vector],
+    world_of_shape: wp.array[int],
+    bits: wp.array[int],
+    forces: wp.array2d[float],
+):
+    """Raise the first column of `forces` to the largest force of a contact between two groups of shapes [N]. One thread per
+    contact.
+    """
+    i = wp.tid()
+    if i >= count[0] or shape0[i] < 0 or shape1[i] < 0:
+        return
+    if between(bits[shape0[i]], bits[shape1[i]]):
+        world = wp.max(world_of_shape[shape0[i]], world_of_shape[shape1[i]])  # that of the ground is -1
+        wp.atomic_max(forces, world, 0, wp.length(wp.spatial_top(force[i])))
+
+
+@wp.kernel
 def flag_lost_contacts(count: wp.array[int], capacity: int, overflow: wp.array[int]):
     """Set the flags of all worlds if the pool of contacts that they share has overflowed, because each may have lost
     contacts. One thread per world.
@@ -218,6 +240,12 @@ class NewtonStateIO(RobotStateIO):
         if simulation.lost is not None:
             inputs = [simulation.lost, simulation.lost_bits]
             wp.launch(take_flags, dim=len(self._qpos), inputs=inputs, outputs=[self._overflow])
+
+    def _find_largest(self, bits: wp.array, forces: wp.array) -> None:
+        of, model = self._simulation.contacts, self._simulation.model
+        inputs = [of.rigid_contact_count, of.rigid_contact_shape0, of.rigid_contact_shape1, self._simulation.force]
+        inputs += [model.shape_world, bits]
+        wp.launch(find_largest_force, dim=of.rigid_contact_max, inputs=inputs, outputs=[forces])
 
     def contact_forces(self) -> None:
         contacts = self._simulation.contacts

@@ -1,9 +1,12 @@
 """A robot on a plane or a terrain: its shapes, the ground, and contact sensors."""
 
+from collections.abc import Mapping
+
 import mujoco
 import numpy as np
 
 from legged.config.world import SimConfig
+from legged.physics.contact_groups import ContactGroups
 from legged.physics.scene.scene import GroundShapes, Scene, set_options
 from legged.physics.scene.terrain_geoms import add_height_field, add_terrain
 from legged.robots.importing.convert import is_plain_file, robot_spec_of
@@ -25,8 +28,9 @@ def robot_spec(robot: Robot, self_collisions: bool) -> mujoco.MjSpec:
     spec = robot_spec_of(robot.model_path)
     for name, armature in zip(robot.joint_names, robot.armature, strict=True):
         spec.joint(name).armature = armature
+    shapes = robot.colliding(self_collisions)
     for geom in spec.geoms:
-        if geom.name in robot.shape_names:
+        if geom.name in shapes:
             geom.contype, geom.conaffinity = ROBOT, GROUND | ROBOT if self_collisions else GROUND
             if geom.priority < 1:  # without priority, MuJoCo takes the larger friction of the two shapes
                 geom.priority, geom.condim = 1, max(geom.condim, 3)
@@ -73,9 +77,12 @@ class RobotScene(Scene):
 
     robot: Robot
 
-    def __init__(self, robot: Robot, terrain: Terrain | None = None) -> None:
-        """Put `robot` on `terrain`, or on a horizontal plane."""
+    def __init__(
+        self, robot: Robot, terrain: Terrain | None = None, contact_groups: Mapping[str, ContactGroups] | None = None
+    ) -> None:
+        """Put `robot` on `terrain`, or on a horizontal plane. Forces between `contact_groups` are measured."""
         self.robot, self.terrain, self.name = robot, terrain, str(robot.folder)
+        self.contact_groups = contact_groups or {}
 
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
         robot, terrain = self.robot, self.terrain
@@ -105,6 +112,8 @@ class RobotScene(Scene):
                 objname=name,
                 intprm=[1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1],  # data: force, reduce: netforce, num: 1
             )
+        for name, groups in self.contact_groups.items() if contact_sensors else ():
+            groups.add_sensors(spec, robot, sim.self_collisions, name)
         return spec.compile()
 
     def shapes(self, model: mujoco.MjModel) -> np.ndarray:

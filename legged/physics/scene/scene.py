@@ -1,12 +1,15 @@
 """Contents of one world, independent of the engine: a robot on a ground, or a file's model with its own floor."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import mujoco
 import numpy as np
 
 from legged.config.world import SimConfig
+from legged.physics.contact_groups import ContactGroups
 from legged.robots.robot import Robot
 from legged.terrain import Terrain
 
@@ -22,6 +25,8 @@ class Scene(ABC):
     """Robot with a floating base and feet; None if the scene has no such robot."""
     terrain: Terrain | None = None
     """Terrain; None for a plane."""
+    contact_groups: Mapping[str, ContactGroups] = MappingProxyType({})
+    """Name -> two groups of shapes between which the engine measures contact forces (`Physics.group_forces`)."""
 
     @abstractmethod
     def model(self, sim: SimConfig, ground: GroundShapes = "exact", contact_sensors: bool = False) -> mujoco.MjModel:
@@ -30,7 +35,7 @@ class Scene(ABC):
         `ground` chooses the geometry of a terrain: height fields and boxes that match its height map exactly (`exact`), one
         height field whose steps are ramps (`height_field`), or a placeholder for the height-map collider (`none`). With
         `contact_sensors`, every collision shape of the robot gets a sensor `contact_<shape>`: the net force that the shape
-        exerts, world frame [N].
+        exerts, world frame [N]. Sensors for `contact_groups` are then added, too.
 
         Raises:
             ConfigError: the model does not exist, or the engines cannot simulate it.

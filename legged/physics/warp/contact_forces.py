@@ -51,6 +51,78 @@ def lanes_with(on: bool) -> int:  # type: ignore[empty-body]
     ...
 
 
+@wp.func
+def frame_force(
+    row: int,
+    rows: int,
+    dim: int,
+    elliptic: bool,
+    friction: Vector5,
+    efc_force: wp.array[float],
+):
+    """Return the force of the contact whose constraint rows begin at `row`, in the contact frame [N]. `efc_force` has the
+    forces of all `rows` of the world.
+
+    With elliptic cones, constraint rows hold the force along the axes of the contact frame. With pyramids, they hold the
+    forces along the edges, each of which is the normal plus or minus friction times a tangent.
+    """
+    force = wp.vec3(0.0)
+    if elliptic or dim == 1:
+        for k in range(3):
+            if k < dim and row + k < rows:
+                force[k] = efc_force[row + k]
+    else:
+        for k in range(dim - 1):
+            edge = row + 2 * k
+            up = wp.where(edge < rows, efc_force[wp.min(edge, rows - 1)], 0.0)
+            down = wp.where(edge + 1 < rows, efc_force[wp.min(edge + 1, rows - 1)], 0.0)
+            force[0] += up + down
+            if k < 2:
+                force[k + 1] = (up - down) * friction[k]
+    return force
+
+
+@wp.func
+def between(first: int, second: int):
+    """Return whether a contact of shapes with these `ContactGroups.bits` is a contact between the groups."""
+    return ((first & 1) != 0 and (second & 2) != 0) or ((first & 2) != 0 and (second & 1) != 0)
+
+
+@wp.kernel
+def shift_forces(forces: wp.array2d[float]):
+    """Move the forces of earlier steps by one column, and set the first column to zero. One thread per world."""
+    world = wp.tid()
+    for k in range(forces.shape[1] - 1, 0, -1):
+        forces[world, k] = forces[world, k - 1]
+    forces[world, 0] = 0.0
+
+
+@wp.kernel
+def find_largest_force(
+    nacon: wp.array[int],
+    rows: int,
+    elliptic: bool,
+    geom: wp.array[wp.vec2i],
+    dim: wp.array[int],
+    address: wp.array2d[int],
+    worldid: wp.array[int],
+    friction: wp.array[Vector5],
+    efc_force: wp.array2d[float],
+    bits: wp.array[int],
+    forces: wp.array2d[float],
+):
+    """Raise the first column of `forces` to the largest force of a contact between two groups of shapes [N]. One thread per
+    contact.
+    """
+    i = wp.tid()
+    if i >= nacon[0] or address[i, 0] < 0:
+        return
+    if between(bits[geom[i][0]], bits[geom[i][1]]):
+        world = worldid[i]
+        force = frame_force(address[i, 0], rows, dim[i], elliptic, friction[i], efc_force[world])
+        wp.atomic_max(forces, world, 0, wp.length(force))
+
+
 @wp.kernel
 def sum_contact_forces(
     lanes: int,
@@ -68,9 +140,6 @@ def sum_contact_forces(
 ):
     """Sum the contact forces on each shape in one launch, for worlds with room for `slots` contacts each. `lanes` threads per
     world. Each thread computes the force of one contact, and then the sum on one shape.
-
-    With elliptic cones, constraint rows hold the force along the axes of the contact frame. With pyramids, they hold the
-    forces along the edges, each of which is the normal plus or minus friction times a tangent.
     """
     world, lane = wp.tid()
     shapes = contact_forces.shape[1]
@@ -85,20 +154,7 @@ def sum_contact_forces(
             on_second = wp.vec3(0.0)
             if row >= 0:
                 shapes_of = wp.vec2i(contact_of_geom[geom[c][0]], contact_of_geom[geom[c][1]])
-                force = wp.vec3(0.0)
-                if elliptic or dim[c] == 1:
-                    for k in range(3):
-                        if k < dim[c] and row + k < rows:
-                            force[k] = efc_force[world, row + k]
-                else:
-                    for k in range(dim[c] - 1):
-                        edge = row + 2 * k
-                        up = wp.where(edge < rows, efc_force[world, wp.min(edge, rows - 1)], 0.0)
-                        down = wp.where(edge + 1 < rows, efc_force[world, wp.min(edge + 1, rows - 1)], 0.0)
-                        force[0] += up + down
-                        if k < 2:
-                            force[k + 1] = (up - down) * friction[c][k]
-                on_second = force @ frame[c]
+                on_second = frame_force(row, rows, dim[c], elliptic, friction[c], efc_force[world]) @ frame[c]
             count = lanes_with(row >= 0)  # contacts with constraint rows come first
             for k in range(count):
                 first, second = whole_from_lane(shapes_of[0], k), whole_from_lane(shapes_of[1], k)

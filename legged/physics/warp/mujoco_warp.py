@@ -14,6 +14,7 @@ from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics.collider.contact_pairs import DEFAULT_SOLREF, is_mixed
 from legged.physics.collider.terrain_contact import TerrainContact
+from legged.physics.contact_groups import geom_names, zero_forces
 from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
@@ -108,6 +109,7 @@ class MujocoWarpPhysics(WarpPhysics):
             solrefs[is_mixed(solrefs)] = DEFAULT_SOLREF  # unlike C MuJoCo, mujoco-warp does not replace mixed solrefs
         keep_centres_apart(self.model, randomized)
         self._randomized = RandomizedModel(scene, self.model, randomized, torch.float32, device)
+        self.group_forces = zero_forces(scene.contact_groups, num_envs, device)
         self._redraws: Redraws | None = None
         self._variants: Variants | None = None
         self._per_world = changed_arrays(randomized)
@@ -141,7 +143,9 @@ class MujocoWarpPhysics(WarpPhysics):
                 slots = 0 if self._contacts is None else int(self._contacts.constants["SLOTS"])
                 of = (self.model, scene.robot, self.robot_state)
                 self._state_io = MujocoWarpStateIO(self._m, d, self.overflowed, *of, slots)
-        launches = (self._state_io.kinematics, self._state_io.contact_forces, *launches)
+                self._state_io.watch(geom_names(self.model), scene.contact_groups, self.group_forces)
+        own = self._state_io
+        launches = (own.kinematics, own.contact_forces, own.measure_groups, *launches)
         constants = (self._set_constants,) if any(FIELDS[name].derived for name in randomized) else ()
         self.compiled = compile_ahead(self._wp_device, (self._step, self._update_quantities, *launches, *constants))
         self.library_step = self._library_step

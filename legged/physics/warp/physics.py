@@ -67,6 +67,7 @@ class WarpPhysics(Physics):
     def step(self) -> None:
         with self._on_device():
             self._advance()
+            self._state_io.measure_groups()
             if self._joints is not None:
                 self._joints.read()
         self._forces_read = False
@@ -83,13 +84,15 @@ class WarpPhysics(Physics):
     def write(self, mask: Tensor, qpos: Tensor, qvel: Tensor) -> None:
         with self._on_device():
             self._state_io.write(mask, qpos, qvel)
+        self._clear_groups(mask)
 
     def push(self, mask: Tensor, delta: Tensor) -> None:
         with self._on_device():
             self._state_io.push(mask, delta, self.qvel)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        state = {"qpos": self.qpos, "qvel": self.qvel}
+        groups = {f"forces_{name}": forces for name, forces in self.group_forces.items()}
+        state = {"qpos": self.qpos, "qvel": self.qvel, **groups}
         if self.robot_state is not None:
             state["contact_forces"] = self.robot_state.contact_forces
         if self.forces is not None:

@@ -5,6 +5,7 @@ take a third of the step's time.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +14,11 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
+from legged.physics.contact_groups import ContactGroups
 from legged.physics.feet import FootChains
 from legged.physics.fused.native import lanes_of
 from legged.physics.robot_state import RobotState
-from legged.physics.warp.contact_forces import add_contact_forces, sum_contact_forces
+from legged.physics.warp.contact_forces import add_contact_forces, find_largest_force, shift_forces, sum_contact_forces
 from legged.robots.robot import Robot
 
 # Overflow flags of dropped contacts or constraint rows. All other flags, such as iteration limits, are ignored.
@@ -169,6 +171,8 @@ class StateIO:
         self._arrays = arrays
         self._overflowed = wp.from_torch(overflowed)
         self._contact_forces = wp.zeros((len(overflowed), 0), dtype=wp.vec3)
+        self._groups: list[tuple[wp.array, wp.array]] = []
+        """`ContactGroups.bits` of the engine's shapes, and the tensor of `Physics.group_forces`, for each pair of groups."""
 
     def write(self, mask: torch.Tensor, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
         """Write the state of the worlds in `mask` (N,): `qpos` (N, nq) and `qvel` (N, nv).
@@ -193,6 +197,21 @@ class StateIO:
 
     def contact_forces(self) -> None:
         """Read the contact forces of tracked shapes from the last step. Without a robot, this does nothing."""
+
+    def watch(self, shapes: Sequence[str], groups: Mapping[str, ContactGroups], forces: Mapping[str, torch.Tensor]) -> None:
+        """Prepare to write the forces between `groups` to `forces`. `shapes` are the names of the engine's shapes, with
+        `GROUND` for the ground. Warp's current device must be that of the arrays.
+        """
+        self._groups = [(wp.array(of.bits(shapes), dtype=int), wp.from_torch(forces[name])) for name, of in groups.items()]
+
+    def measure_groups(self) -> None:
+        """Update `Physics.group_forces` after a step."""
+        for bits, forces in self._groups:
+            wp.launch(shift_forces, dim=len(forces), outputs=[forces])
+            self._find_largest(bits, forces)
+
+    def _find_largest(self, bits: wp.array, forces: wp.array) -> None:
+        """Write the largest force between two groups of shapes in the last step to the first column of `forces`."""
 
 
 class RobotStateIO(StateIO, ABC):
@@ -230,6 +249,9 @@ class RobotStateIO(StateIO, ABC):
 
     @abstractmethod
     def contact_forces(self) -> None: ...
+
+    @abstractmethod
+    def _find_largest(self, bits: wp.array, forces: wp.array) -> None: ...
 
 
 class MujocoWarpStateIO(RobotStateIO):
@@ -276,6 +298,12 @@ class MujocoWarpStateIO(RobotStateIO):
             inputs=[d.nacon, d.contact.geom, d.contact.worldid, self._forces, self._contact_of_geom],
             outputs=[self._contact_forces],
         )
+
+    def _find_largest(self, bits: wp.array, forces: wp.array) -> None:
+        d, of = self._d, self._d.contact
+        inputs = [d.nacon, d.njmax, self._m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC, of.geom, of.dim, of.efc_address]
+        inputs += [of.worldid, of.friction, d.efc.force, bits]
+        wp.launch(find_largest_force, dim=d.naconmax, inputs=inputs, outputs=[forces])
 
 
 def arrays_of(d: Any) -> EngineArrays:
