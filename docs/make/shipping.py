@@ -18,7 +18,9 @@ from legged.learning.timing import TIMING_FILE
 from legged.process.paths import make_folder, relative, write_bytes
 
 LARGEST = 700_000
-"""Size limit of a file with the critic [bytes]; a larger file holds the actor alone."""
+"""Size limit of a shipped checkpoint [bytes]. If needed, the critic is left out, and then weights are stored in float16."""
+FEW = 4096
+"""Parameters with at most this many numbers keep float32."""
 ACTOR = ("actor_state_dict", "iter", "infos")
 BOTH = (*ACTOR, "critic_state_dict")
 MEASURED = (MOTORS, TIMING_FILE, "evaluation_*", "stress_*", "crossing.*", "time_to_walk.json")
@@ -66,15 +68,18 @@ def ship(runs: Sequence[Record], folder: Path) -> list[str]:
 
 
 def _small(checkpoint: Path) -> memoryview:
-    """Return a checkpoint's file without the state of the optimiser. If the file is too large, the critic is left out too.
+    """Return a checkpoint's file without the state of the optimiser, made smaller as `LARGEST` says.
 
     Raises:
         ConfigError: the checkpoint can't be read.
     """
     saved = read_checkpoint(checkpoint)
-    for parts in (BOTH, ACTOR):
+    actor = saved["actor_state_dict"]
+    large = {name for name, value in actor.items() if value.is_floating_point() and value.numel() > FEW}
+    small = {name: value.half() if name in large else value for name, value in actor.items()}
+    for parts, weights in ((BOTH, actor), (ACTOR, actor), (ACTOR, small)):
         buffer = io.BytesIO()
-        torch.save({part: saved[part] for part in parts if part in saved}, buffer)
+        torch.save({**{part: saved[part] for part in parts if part in saved}, "actor_state_dict": weights}, buffer)
         if buffer.tell() <= LARGEST:
             break
     return buffer.getbuffer()

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper, numpy_helper
 from legged.cli.main import main
 from legged.errors import ConfigError
 from legged.evaluation.trackers import Tracker
-from legged.policies.foreign import Layout
+from legged.policies.foreign import Layout, read_layout
 from legged.process.paths import data_folder
 from legged.robots.robot import load_robot
 
@@ -133,3 +133,17 @@ def test_a_layout_or_an_option_that_does_not_fit_is_named(capsys, text, options,
     Path("mine.yaml").write_text(text)
     assert main(["evaluate", "onnx", "tracker.onnx", "--layout", "mine.yaml", *options]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_tracker_observes_the_velocity_at_its_imu():
+    """Half a metre ahead of the base, a turn of 2 rad/s to the left adds 1 m/s to the left."""
+    tracker = Tracker(tracker_file(), layout(velocity_point=(0.5, 0.0, 0.0)))
+    tracker.task.base_lin_vel.copy_(torch.tensor([[1.0, 0.0, 0.0]]))
+    tracker.task.base_ang_vel.copy_(torch.tensor([[0.0, 0.0, 2.0]]))
+    tracker._terms = {"base_lin_vel": 1.0}
+    assert tracker._observe().tolist() == [pytest.approx([1.0, 1.0, 0.0])]
+
+
+def test_layouts_of_the_package_name_trackers():
+    for name in ("holosoma_tracker", "holosoma_tracker_fastsac", "mjlab_tracker"):
+        assert read_layout(name, "--layout").task == "g1_tracking"

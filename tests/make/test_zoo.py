@@ -11,7 +11,7 @@ import pytest
 import torch
 import zoo
 from helpers import POLICY, TASK, TINY_TRAINING, call, run_folders, tiny_run, wait_for
-from shipping import LARGEST, ship
+from shipping import FEW, LARGEST, ship
 
 from legged.errors import ConfigError
 from legged.evaluation.reports.record import read_record
@@ -266,6 +266,17 @@ def test_of_a_large_policy_the_actor_alone_is_shipped():
     (line,) = ship([run], Path("shipped"))
     assert line.startswith(f"shipped/{TASK}: policy of seed 1, 0.0")
     assert set(torch.load(Path("shipped") / TASK / "model.pt", weights_only=True)) == {"actor_state_dict", "iter", "infos"}
+
+
+def test_weights_of_a_large_actor_are_shipped_in_float16():
+    run = read_record(run_of_seed(1))
+    saved = torch.load(run.folder / "model_0.pt", weights_only=True)
+    saved["actor_state_dict"]["large"] = torch.full((LARGEST // 4,), 1.0 / 3.0)
+    torch.save(saved, run.folder / "model_0.pt")
+    ship([run], Path("shipped"))
+    actor = torch.load(Path("shipped") / TASK / "model.pt", weights_only=True)["actor_state_dict"]
+    assert actor.pop("large").dtype == torch.float16
+    assert {value.dtype for name, value in actor.items() if value.numel() <= FEW} == {torch.float32}
 
 
 def test_of_several_seeds_the_lowest_gives_the_policy_and_the_others_what_they_came_to():
