@@ -24,7 +24,7 @@ from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
 os.environ.setdefault("WANDB_MODE", "disabled")
-os.environ.setdefault("MUJOCO_GL", "disable")
+os.environ["MUJOCO_GL"] = "disable"  # nothing is rendered, and stand-ins can't render
 
 from stand_ins import stand_in  # noqa: E402
 
@@ -80,10 +80,11 @@ class Timed(MjlabOnPolicyRunner):
             torch.cuda.synchronize()
         before = time.perf_counter()
         wall_s = before - self.began_s - self.exporting_s
+        written = self.folder / f"{self.folder.name}.onnx"  # by runners of tracking tasks, with its metadata
+        written.unlink(missing_ok=True)  # if the runner can't write it, it only warns
         super().save(path, infos)
         done = self.current_learning_iteration + 1
         name = f"policy_{done:05d}.onnx"
-        written = self.folder / f"{self.folder.name}.onnx"  # by runners of tracking tasks, with its metadata
         if not written.is_file():
             self.export_policy_to_onnx(str(self.folder), name)
             written = self.folder / name
