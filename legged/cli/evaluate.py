@@ -26,13 +26,13 @@ from legged.evaluation.following import (
     evaluate_following,
 )
 from legged.evaluation.measurement import Setting
-from legged.evaluation.motions import evaluate_motions
+from legged.evaluation.motions import SUCCESS_S, evaluate_motions, motions_table
 from legged.evaluation.playback import SETTLING_S, follow, play
 from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.disturbances import NAMES
 from legged.evaluation.stress.measuring import RISER, TREAD, Bench, evaluate_stress
 from legged.evaluation.success import TYPES_HELP, chosen_sizes
-from legged.evaluation.trackers import Tracker, trackers_table
+from legged.evaluation.trackers import EPISODES, Tracker
 from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
@@ -368,7 +368,8 @@ def onnx(args: argparse.Namespace) -> int:
     to it, which describes robot and control. For a policy of another project, give --robot and --layout.
 
     If the layout names a `task`, or policy.json describes a policy that tracks motions, the files are trackers, which hold
-    their motion. The robot then tracks it to the end. Of an exported folder, all trackers are measured.
+    their motion. Robots then track it from random frames for 10 s, and from the first frame to its end. Of an exported
+    folder, all trackers are measured.
 
     With --vx, --vy or --yaw the errors over a grid of commands are measured, and policies are sorted by training time. With
     --rmse the command also prints the first policy whose velocity RMSE is at most --rmse and whose robot never falls.
@@ -422,11 +423,12 @@ def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) 
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
     result = [
-        Tracker(tracker, layout).replay()
+        Tracker(tracker, layout).measure()
         for path, layout in zip(files, layouts, strict=True)
         for tracker in _trackers(path, layout)
     ]
-    Console(width=130).print(trackers_table(result))
+    title = f"trackers in C MuJoCo: {EPISODES} episodes of {SUCCESS_S:g} s a motion"
+    Console(width=140).print(motions_table(title, ((Path(row["file"]).name, row) for row in result)))
     if args.out is not None:
         make_folder(args.out)
         write_text(args.out / RESULT, json.dumps({"trackers": result}, indent=1))

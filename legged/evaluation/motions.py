@@ -1,6 +1,7 @@
 """Evaluation of policies that track motions: success and errors of each motion, with intervals."""
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +58,13 @@ def evaluate_motions(setting: Setting, episodes: int) -> int:
         ]
         task, act = restore(setting.policy, changes, setting.device, setting.graph)
         overflows = Overflows()
-        measured[file.stem] = {**_from_anywhere(task, act, overflows), "whole": _from_the_beginning(task, act)}
+        measured[file.stem] = measure_motion(task, act, overflows)
         lost += overflows.total(task)
     result = {**head, "wall_s": time.perf_counter() - start, "success_s": SUCCESS_S, "motions": measured}
-    Console(width=140).print(_table(result))
+    title = (
+        f"{result['task']} ({result['checkpoint']}) in {result['physics']}: {episodes} episodes of {SUCCESS_S:g} s a motion"
+    )
+    Console(width=140).print(motions_table(title, measured.items()))
     path = setting.folder / motions_name(result["physics"])
     write_result(path, result)
     print(f"written: {relative(path)}")
@@ -72,6 +76,11 @@ def on_the_motion() -> list[tuple[str, Any]]:
     """Return overrides with which episodes begin exactly on the motion, in frames that are all equally likely."""
     nowhere = [(f"motion.{name}_noise", [0.0] * 6) for name in ("pose", "velocity")]
     return [("motion.memory", 0.0), *nowhere, ("motion.joint_noise", [0.0, 0.0])]
+
+
+def measure_motion(task: MotionTracking, act: Policy, overflows: Overflows) -> dict[str, Any]:
+    """Return success and mean errors of robots that begin in random frames, and whether one tracks the whole motion."""
+    return {**_from_anywhere(task, act, overflows), "whole": _from_the_beginning(task, act)}
 
 
 @torch.inference_mode()
@@ -120,15 +129,14 @@ def _from_the_beginning(task: MotionTracking, act: Policy) -> dict[str, Any]:
     return {"success": True, "lasted_s": last * task.dt}
 
 
-def _table(result: dict[str, Any]) -> Table:
+def motions_table(title: str, measured: Iterable[tuple[str, dict[str, Any]]]) -> Table:
+    """Return a table of the results of `measure_motion`, each with the name of its motion or file."""
     heads = ("motion", "length [s]", "success [%] (95 % interval)", "whole motion", "body error [m]", "in the world [m]")
     rows = []
-    for name, found in result["motions"].items():
+    for name, found in measured:
         whole = found["whole"]
         share, low, high = (100.0 * found[key] for key in ("share", "low", "high"))
         errors = (f"{found[key]:.3f}" for key in ("body_error", "world_error", "extremity_error", "joint_error"))
         lasted = "tracked" if whole["success"] else f"falls at {whole['lasted_s']:.1f} s"
         rows.append([name, f"{found['seconds']:.1f}", f"{share:.1f} ({low:.1f} to {high:.1f})", lasted, *errors])
-    count = next(iter(result["motions"].values()))["episodes"]
-    title = f"{result['task']} ({result['checkpoint']}) in {result['physics']}: {count} episodes of {SUCCESS_S:g} s a motion"
     return screen_table(title, [*heads, "extremities [m]", "joints [rad]"], rows)

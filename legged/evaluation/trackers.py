@@ -5,28 +5,30 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.table import Table
 from torch import Tensor
 
 from legged.config.tracking import tracks_motions
 from legged.deploy.policy import listed, open_onnx
-from legged.envs.motion_tracking import ERRORS, MotionTracking
+from legged.envs.motion_tracking import MotionTracking
 from legged.errors import ConfigError, suggest
-from legged.evaluation.motions import ENDLESS_S, on_the_motion
+from legged.evaluation.measurement import Overflows
+from legged.evaluation.motions import ENDLESS_S, measure_motion, on_the_motion
 from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout
 from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
-from legged.tables import screen_table
 
+EPISODES = 128
+"""Robots that begin in random frames of a tracker's motion."""
 INPUTS, ACTIONS = ("obs", "time_step"), "actions"
 
 
 class Tracker:
-    """A tracker on the robot of a task, in C MuJoCo."""
+    """A tracker on the robots of a task, in C MuJoCo."""
 
-    def __init__(self, path: Path, layout: Layout) -> None:
-        """Load the ONNX file at `path`, and build the task that its layout names, with the file's motion and gains.
+    def __init__(self, path: Path, layout: Layout, episodes: int = EPISODES) -> None:
+        """Load the ONNX file at `path`, and build the task that its layout names, with the file's motion and gains and with
+        `episodes` robots.
 
         Raises:
             ConfigError: the file can't be read, or does not fit the task.
@@ -44,7 +46,7 @@ class Tracker:
             raise ConfigError(f"layout: task: '{layout.task}' tracks no motions")
         gains = {"stiffness": listed(path, said, STIFFNESS), "damping": listed(path, said, DAMPING)}
         changes: list[tuple[str, Any]] = [
-            *undisturbed(cfg, 1, ENDLESS_S),
+            *undisturbed(cfg, episodes, ENDLESS_S),
             *on_the_motion(),
             ("motion.files", [str(path)]),
             ("control.action_scale", layout.action_scale),
@@ -79,7 +81,7 @@ class Tracker:
             raise ConfigError(f"{path}: takes {asked} numbers, but the layout's observation has {width}")
 
     def _observe(self) -> Tensor:
-        """Return the observation (1, width)."""
+        """Return the observations (N, width)."""
         parts = []
         for name, scale in self._terms.items():
             values = getattr(self.task, f"_obs_{name}")()
@@ -88,35 +90,21 @@ class Tracker:
             parts.append(scale * (values[:, self._columns[name]] if name in self._columns else values))
         return torch.cat(parts, dim=1).clamp(-self._clip, self._clip)
 
-    @torch.inference_mode()
-    def replay(self) -> dict[str, Any]:
-        """Let the robot track the motion from its first frame to its last, or to a failure. Return whether it succeeded, how
-        long it lasted and should last [s], and the mean errors.
+    def measure(self) -> dict[str, Any]:
+        """Let the robots track the motion, from random frames and from the first one (`measure_motion`)."""
+        return {"file": str(self._path), **measure_motion(self.task, self._act, Overflows())}
+
+    def _act(self, _: Any) -> Tensor:
+        """Return the network's actions (N, A) for the robots' states. Files take one observation at a time.
+
+        Raises:
+            ConfigError: the network's actions are not finite, or of another number than the joints.
         """
-        task = self.task
-        errors: list[Tensor] = []
-        last = len(task.motion.table.rows) - 1
-        task.start_at(torch.zeros_like(task.motion.frame))
-        failed = False
-        while len(errors) < last and not failed:
-            given = {"obs": self._observe().numpy(), "time_step": task.motion.frame.float().view(1, 1).numpy()}
-            actions = self._session.run([ACTIONS], given)[0]
-            if actions.shape != (1, len(self._back)) or not np.isfinite(actions).all():
-                raise ConfigError(f"{self._path}: expected {len(self._back)} finite actions, got {actions.shape}")
-            task.step(torch.from_numpy(np.array(actions))[:, self._back])
-            errors.append(task.errors[0].clone())
-            failed = bool(task.terminated_buf[0])
-        means = torch.stack(errors).mean(dim=0).tolist()
-        times = {"success": not failed, "lasted_s": len(errors) * task.dt, "seconds": last * task.dt}
-        return {"file": str(self._path), **times, **dict(zip(ERRORS, means, strict=True))}
-
-
-def trackers_table(rows: list[dict[str, Any]]) -> Table:
-    """Return a table of the results of `Tracker.replay`."""
-    heads = ("file", "motion [s]", "whole motion", "body error [m]", "in the world [m]", "extremities [m]", "joints [rad]")
-    cells = []
-    for row in rows:
-        lasted = "tracked" if row["success"] else f"falls at {row['lasted_s']:.1f} s"
-        errors = [f"{row[key]:.3f}" for key in ("body_error", "world_error", "extremity_error", "joint_error")]
-        cells.append([Path(row["file"]).name, f"{row['seconds']:.1f}", lasted, *errors])
-    return screen_table("trackers in C MuJoCo", heads, cells)
+        frames = self.task.motion.frame.float().numpy()
+        actions = []
+        for observation, frame in zip(self._observe().numpy(), frames, strict=True):
+            given = {"obs": observation[None], "time_step": frame.reshape(1, 1)}
+            actions.append(self._session.run([ACTIONS], given)[0])
+            if actions[-1].shape != (1, len(self._back)) or not np.isfinite(actions[-1]).all():
+                raise ConfigError(f"{self._path}: expected {len(self._back)} finite actions, got {actions[-1].shape}")
+        return torch.from_numpy(np.concatenate(actions))[:, self._back]

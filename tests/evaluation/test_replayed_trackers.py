@@ -61,45 +61,55 @@ def layout(**changes) -> Layout:
 
 def test_the_robot_holds_the_pose_of_the_network_until_it_fails():
     """Actions 0: the default pose, with which a squat fails after about a second, and never reaches its end."""
-    result = Tracker(tracker_file(), layout()).replay()
-    assert not result["success"]
+    result = Tracker(tracker_file(), layout(), 2).measure()
+    assert not result["whole"]["success"]
     assert result["seconds"] == pytest.approx(5.5)
-    assert 0.5 < result["lasted_s"] < 4.0
+    assert 0.5 < result["whole"]["lasted_s"] < 4.0
+    assert result["successes"] == 0
     assert 0.0 < result["joint_error"] < 1.0
 
 
 def test_the_network_sees_the_reference_of_the_step_and_moves_the_joints():
     """Actions that are the reference's angles: those of the frame to reach in this step."""
-    tracker = Tracker(tracker_file(gain=1.0), layout())
+    tracker = Tracker(tracker_file(gain=1.0), layout(), 2)
     task, targets = tracker.task, []
     step = task.step
 
     def steps(actions):
-        targets.append((actions[0].clone(), task.motion.now.joint_pos[0].clone()))
+        targets.append((actions.clone(), task.motion.now.joint_pos.clone()))
         return step(actions)
 
     task.step = steps
-    tracker.replay()
+    tracker.measure()
     for actions, reference in targets:
         torch.testing.assert_close(actions, reference, atol=1e-5, rtol=0.0)
-    assert len({float(reference[3]) for _, reference in targets}) > 20  # the knee moves
+    for robot in (0, 1):  # each sees its own frame
+        assert len({float(reference[robot, 3]) for _, reference in targets}) > 20  # the knee moves
 
 
 def test_joints_may_have_another_order():
     """The same network with its joints in reverse: the robot does the same."""
-    found = [Tracker(tracker_file(0.2, 0.01, reverse=reverse), layout()).replay() for reverse in (False, True)]
-    assert found[0].pop("file") == found[1].pop("file")
-    assert found[0] == pytest.approx(found[1], rel=1e-3, abs=1e-4)
+    found = []
+    for reverse in (False, True):
+        task = (tracker := Tracker(tracker_file(0.2, 0.01, reverse=reverse), layout(), 1)).task
+        observations, states = task.start_at(torch.zeros_like(task.motion.frame)), []
+        for _ in range(25):
+            observations, *_ = task.step(tracker._act(observations))
+            states.append(task.dof_pos.clone())
+        found.append(torch.cat(states))
+    torch.testing.assert_close(*found, atol=1e-4, rtol=1e-3)
 
 
 def test_the_command_prints_and_writes_what_it_found(capsys):
     tracker_file()
     Path("mine.yaml").write_text(f"task: g1_tracking\nobservation: {json.dumps(TERMS)}\naction_scale: 1.0\n")
     assert main(["evaluate", "onnx", "tracker.onnx", "--layout", "mine.yaml", "--out", "out"]) == 0
-    assert "falls at" in capsys.readouterr().out
+    assert "falls at" in (printed := capsys.readouterr().out)
+    assert "128 episodes of 10 s" in printed
     (row,) = json.loads(Path("out/onnx.json").read_text())["trackers"]
     assert row["file"] == "tracker.onnx"
-    assert not row["success"]
+    assert row["episodes"] == 128
+    assert not row["whole"]["success"]
 
 
 @pytest.mark.parametrize(
@@ -137,7 +147,7 @@ def test_a_layout_or_an_option_that_does_not_fit_is_named(capsys, text, options,
 
 def test_a_tracker_observes_the_velocity_at_its_imu():
     """Half a metre ahead of the base, a turn of 2 rad/s to the left adds 1 m/s to the left."""
-    tracker = Tracker(tracker_file(), layout(velocity_point=(0.5, 0.0, 0.0)))
+    tracker = Tracker(tracker_file(), layout(velocity_point=(0.5, 0.0, 0.0)), 1)
     tracker.task.base_lin_vel.copy_(torch.tensor([[1.0, 0.0, 0.0]]))
     tracker.task.base_ang_vel.copy_(torch.tensor([[0.0, 0.0, 2.0]]))
     tracker._terms = {"base_lin_vel": 1.0}

@@ -234,6 +234,20 @@ def test_a_captured_step_on_the_ground_is_nearly_the_eager_one():
     assert captured.physics.robot_state.contact_forces.norm(dim=2).sum(dim=1).median() > 100.0
 
 
+def test_a_captured_tracker_is_nearly_the_eager_one():
+    """Frames, noise and randomised values are drawn alike, and a quarter of a second later most robots are alike."""
+    cfg = config(("sim.physics", "mujoco_warp"), task="g1_tracking")
+    captured, eager = make_task(cfg, CUDA), make_task(cfg, CUDA, graph=False)
+    assert (captured.captured, eager.captured) == (True, False)
+    states = eager.state_dict()
+    found, expected = (rollout(task, 0.3, states)[0][12] for task in (captured, eager))
+    for name in found:
+        difference = (found[name].float() - expected[name].float()).abs().view(ROBOTS, -1).amax(dim=1)
+        alike = difference < 1e-2
+        assert alike.float().mean() > 0.9, f"{name}: of {ROBOTS} robots {int(alike.sum())} are alike"
+    assert found["actor"].std() > 0.01
+
+
 class ReadsOnTheHost(LeggedRobot):
     def _reward_mine(self) -> torch.Tensor:
         return self.base_pos[:, 2] * (1.0 if self.base_pos[0, 2] > 0.0 else 2.0)
