@@ -31,6 +31,7 @@ NEW_GROUND = ("dense_blocks", "kerbs", "rubble")
 FLAT = ("anymal_c", "anymal_b", "anymal_d", "spot", "go1", "go2", "go2w", "a1", "g1", "h1", "cassie")
 TOLD_LESS = ("blind", "proprio", "estimator", "student", "student_ppo")
 """Variants of anymal_c whose policies observe less."""
+REAL = tuple(f"{robot}_real" for robot in ("anymal_c", "go2", "g1", "h1", "cassie"))
 SOLVERS = ("mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit")
 Result = dict[str, Any]
 
@@ -238,9 +239,7 @@ def _rough_row(policies: Path, task: str) -> list[str]:
 
 def real(policies: Path) -> str:
     """Return the table of tasks for real robots: training, errors and success."""
-    return table(
-        ("task", *TRAINING, *ERRORS, *CROSSINGS), [_rough_row(policies, f"{name}_real") for name in ("anymal_c", "go2")]
-    )
+    return table(("task", *TRAINING, *ERRORS, *CROSSINGS), [_rough_row(policies, name) for name in REAL])
 
 
 def real_stress(policies: Path) -> str:
@@ -253,7 +252,7 @@ def real_stress(policies: Path) -> str:
         **{name: name for name in ("delay 20 ms", "delay 40 ms", "pushes", "together", "everything")},
     }
     rows = []
-    for task in ("anymal_c_real", "go2_real"):
+    for task in REAL:
         result = read(policies / task, STRESS)
         lines = {line["name"]: line["stairs"]["share"] for line in result["lines"]}
         shares = [*(lines[name] for name in names), *(result["ground"][name]["share"] for name in NEW_GROUND)]

@@ -62,10 +62,8 @@ def test_a_row_has_training_and_quality_of_the_shipped_run(root):
 
 def test_success_is_that_of_the_last_trained_step_height_and_the_next(root):
     success = {"robots_per_point": 8, "types": dict.fromkeys(tables.CROSSED, POINTS)}
-    for robot in ("anymal_c", "go2"):
-        write(
-            root, f"{robot}_real", timing=TIMING, evaluation_mujoco={"rough": evaluation(), "task": "x", "success": success}
-        )
+    for task in tables.REAL:
+        write(root, task, timing=TIMING, evaluation_mujoco={"rough": evaluation(), "task": "x", "success": success})
     row = tables.real(root / "resources/policies").splitlines()[2]
     assert row.endswith("|0.055 (0.110)|0.049 (0.081)|0.05|0.20, 0.30|75, 62|75, 62|75, 62|8|")
 
