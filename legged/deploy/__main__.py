@@ -96,7 +96,7 @@ def _main(argv: list[str] | None) -> int:
     check_folder(args.log.parent)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a wrong policy before UnitreeRobot ends the robot's own controller
-        policy.contract.check_fits(KINDS[args.robot].facts)
+        policy.fit(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
     hurries = take_priority()  # the threads of a robot's SDK start later, and inherit the priority
