@@ -30,18 +30,20 @@ DECIMALS = 3
 
 
 class Converted(nn.Module):
-    """A network with the observations and actions of another format, whose joints have the order `order`, (D,) of ours."""
+    """A network with the observations and actions of another format. The format knows the A joints that have an action."""
 
     input_names, output_names = ("obs",), ("actions",)
 
     def __init__(self, network: nn.Module, contract: Contract, order: np.ndarray) -> None:
-        """Convert `network`, observations (batch, width) -> actions (batch, D), of a policy with an action for each joint."""
+        """Convert `network`, observations (batch, width) -> actions (batch, A). `order` (A,) sorts our actions as theirs."""
         super().__init__()
-        self.network, self.order, self.contract = network, order, contract
-        self.default = contract.default.round(DECIMALS)
-        """(D,) default angles [rad] and scales of actions [rad] that the format states, in our order."""
-        self.scale = np.maximum(contract.action_scale.round(DECIMALS), 10.0**-DECIMALS)
-        ratio, lost = contract.action_scale / self.scale, contract.default - self.default
+        self.network, self.contract = network, contract
+        self.joints = contract.acted[order]
+        """(A,) index of each joint of the format among ours. Default angles and scales of actions [rad] have this order."""
+        default, scale = contract.default[contract.acted], contract.action_scale
+        near, rounded = default.round(DECIMALS), np.maximum(scale.round(DECIMALS), 10.0**-DECIMALS)
+        self.default, self.scale = near[order], rounded[order]
+        ratio, lost = scale / rounded, default - near
         columns = []
         factor, offset = np.ones(contract.width), np.zeros(contract.width)
         for group in contract.groups:
@@ -51,14 +53,14 @@ class Converted(nn.Module):
                     columns.append(own[order] if term.name in JOINT_TERMS else own)
                     factor[own] = term.scale / ratio if term.name == "actions" else term.scale
                     if term.name in ("dof_pos", "actions"):
-                        offset[own] = -term.scale * (lost if term.name == "dof_pos" else lost / contract.action_scale)
+                        offset[own] = -term.scale * (lost if term.name == "dof_pos" else lost / scale)
         self._source, self._order = torch.tensor(np.argsort(np.concatenate(columns))), torch.tensor(order)
         self._factor, self._offset, self._ratio, self._shift = (
-            torch.tensor(values, dtype=torch.float32) for values in (factor, offset, ratio, lost / self.scale)
+            torch.tensor(values, dtype=torch.float32) for values in (factor, offset, ratio, lost / rounded)
         )
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Return the actions (batch, D) for the format's observations (batch, width)."""
+        """Return the actions (batch, A) for the format's observations (batch, width)."""
         clip, limit = self.contract.action_clip, self.contract.observation_clip
         seen = (obs[:, self._source] * self._factor + self._offset).clip(-limit, limit)
         actions: Tensor = self.network(seen).clip(-clip, clip)
@@ -84,9 +86,10 @@ def export_as(task: BaseTask, policy: Any, folder: Path, form: str, run: str = "
         RunError: a file cannot be written.
     """
     contract = _expressible(task, form)
-    names = contract.joint_names
-    motors = (sdk_names(len(names)) if form == "unitree" else None) or names
-    network = Converted(policy.as_onnx(verbose=False).eval(), contract, np.array([names.index(name) for name in motors]))
+    names = [contract.joint_names[i] for i in contract.acted]
+    motors = sdk_names(len(contract.joint_names)) if form == "unitree" else None
+    order = sorted(range(len(names)), key=lambda i: (motors or names).index(names[i]))
+    network = Converted(policy.as_onnx(verbose=False).eval(), contract, np.array(order))
     content = onnx_of(network, mjlab_metadata(network, run), free=False)
     seen = torch.randn(CHECKED_OBSERVATIONS, contract.width)
     wanted = network(seen).numpy()
@@ -114,20 +117,27 @@ def _expressible(task: BaseTask, form: str) -> Contract:
         raise wrong("task", f"--format {form} is for policies that follow velocity commands, got '{cfg.task}'{hint}")
     if cfg.control.laws != {"P"}:
         raise wrong("control.control_type", f"--format {form} knows joint position targets only (P)")
-    if cfg.control.held:
-        raise wrong("control.held", f"--format {form} needs an action for each joint, got {list(cfg.control.held)}")
     if cfg.train.policy.rnn_type != "none":
         raise wrong("train.policy.rnn_type", f"--format {form} has no hidden state, got '{cfg.train.policy.rnn_type}'")
     described = describe(task)
-    joints, seen = described["joint_names"], [term["name"] for term in described["observation"]]
+    joints, acted, seen = (
+        described["joint_names"],
+        described["action_joints"],
+        [term["name"] for term in described["observation"]],
+    )
     if form == "unitree" and set(joints) != set(sdk_names(len(joints)) or ()):
         raise wrong(
             "robot", f"--format unitree numbers the motors of Unitree's robots ({', '.join(KINDS)}), got '{cfg.robot}'"
         )
     known = MJLAB_TERMS if form == "mjlab" else UNITREE_TERMS
     for term in described["observation"]:
-        name, size = term["name"], term["size"]
-        if name not in known.values() or size != (len(joints) if name in JOINT_TERMS else 3) or seen.count(name) > 1:
+        name, size, of_joints = term["name"], term["size"], term["name"] in JOINT_TERMS
+        if of_joints and (size != len(acted) or term.get("joints", acted) != acted):
+            shown = (
+                f"--format {form} knows only joints with an action, but '{name}' has {size} numbers for {len(acted)} actions"
+            )
+            raise wrong("control.held", shown)
+        if name not in known.values() or size != (len(acted) if of_joints else 3) or seen.count(name) > 1:
             text = f"--format {form} cannot express '{name}' of {size} numbers (once each: {', '.join(known.values())})"
             raise wrong(f"observations.groups.{term['group']}", text)
     return contract_of(Path(cfg.task), described)
@@ -137,16 +147,16 @@ def mjlab_metadata(network: Converted, run: str) -> dict[str, str]:
     """Return mjlab's metadata as text. Besides, `fps` is the number of control steps per second, and `command_ranges` are the
     limits of vx, vy [m/s] and yaw rate [rad/s].
     """
-    contract, order = network.contract, network.order
+    contract, joints = network.contract, network.joints
     theirs = {ours: name for name, ours in MJLAB_TERMS.items()}
     rows = [(theirs[term.name], group.history) for group in contract.groups for term in group.terms]
     return {
         "run_path": run or "none",
-        "joint_names": ",".join(contract.joint_names[i] for i in order),
-        "joint_stiffness": _listing(contract.stiffness[order]),
-        "joint_damping": _listing(contract.damping[order]),
-        "default_joint_pos": _listing(network.default[order]),
-        "action_scale": _listing(network.scale[order]),
+        "joint_names": ",".join(contract.joint_names[i] for i in joints),
+        "joint_stiffness": _listing(contract.stiffness[joints]),
+        "joint_damping": _listing(contract.damping[joints]),
+        "default_joint_pos": _listing(network.default),
+        "action_scale": _listing(network.scale),
         "command_names": "twist",
         "observation_names": ",".join(name for name, _ in rows),
         "observation_terms_scale": _listing([1.0] * len(rows)),
@@ -160,16 +170,18 @@ def mjlab_metadata(network: Converted, run: str) -> dict[str, str]:
 
 def deploy_yaml(network: Converted) -> dict[str, Any]:
     """Return the contents of deploy.yaml. Joints are in the order of the motors."""
-    contract, order = network.contract, network.order
+    contract, joints = network.contract, network.joints
     theirs = {ours: name for name, ours in UNITREE_TERMS.items()}
-    default = network.default[order].tolist()
+    motors = sdk_names(len(contract.joint_names)) or ()
+    in_motor_order = [contract.joint_names.index(name) for name in motors]
+    default = network.default.tolist()
     ranges = dict(zip(RANGES.values(), contract.command_ranges.round(DECIMALS).tolist(), strict=True))
-    action = {"clip": None, "joint_names": [".*"], "scale": network.scale[order].tolist(), "offset": list(default)}
+    action = {"clip": None, "joint_names": [".*"], "scale": network.scale.tolist(), "offset": list(default)}
     return {
-        "joint_ids_map": list(range(len(default))),
+        "joint_ids_map": [motors.index(contract.joint_names[i]) for i in joints],
         "step_dt": contract.control_dt,
-        "stiffness": contract.stiffness[order].tolist(),
-        "damping": contract.damping[order].tolist(),
+        "stiffness": contract.stiffness[in_motor_order].round(DECIMALS).tolist(),
+        "damping": contract.damping[in_motor_order].round(DECIMALS).tolist(),
         "default_joint_pos": default,
         "commands": {"base_velocity": {"ranges": {**ranges, "heading": None}}},
         "actions": {"JointPositionAction": {**action, "joint_ids": None}},

@@ -27,6 +27,7 @@ SMALL = [
 ]
 BLIND = ["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions"]
 GO2_MOTORS = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
+UNJOINTED = [name for name in BLIND if not name.startswith("dof_")]
 ONE_FRAME = [("observations.actor", BLIND)]
 
 
@@ -148,22 +149,21 @@ def walk_along(task, runner, network, readers):
     commands = torch.tensor([[0.5, 0.2, -0.3], [-0.4, 0.0, 0.8]])
     observations = task.hold_commands(commands)
     network.reset()
-    names, largest = task.robot.joint_names, 0.0
+    places, largest = [task.robot.joint_names.index(name) for name in readers[0].joints], 0.0
     for _ in range(100):
         with torch.inference_mode():
             actions = act(observations)
         task.control.set_actions(actions.clip(-task.cfg.control.clip_actions, task.cfg.control.clip_actions))
         for robot, reader in enumerate(readers):
             targets = reader.act(measured_in(task, robot, commands[robot].double().numpy()))
-            np.testing.assert_allclose([targets[name] for name in names], task.control._target[robot], rtol=0.0, atol=1e-5)
+            np.testing.assert_allclose([*targets.values()], task.control._target[robot][places], rtol=0.0, atol=1e-5)
         largest = max(largest, float(actions.abs().max()))
         observations, _, dones, _ = task.step(actions)
         for robot in dones.nonzero().flatten().tolist():
             readers[robot].restart()
     assert largest > 0.2
     for key, values in zip(("p_gain", "d_gain"), readers[0].gains, strict=True):
-        mine = dict(zip(names, task.control.nominal[key].tolist(), strict=True))
-        np.testing.assert_allclose(values, [mine[name] for name in readers[0].joints], rtol=0.0, atol=5e-4)
+        np.testing.assert_allclose(values, task.control.nominal[key][places], rtol=0.0, atol=5e-4)
 
 
 @pytest.mark.slow
@@ -173,8 +173,9 @@ def walk_along(task, runner, network, readers):
         ("anymal_c_flat", [("train.policy.obs_normalization", True), ("control.action_scale", 0.43857)]),
         ("anymal_c_flat", [*ONE_FRAME, ("observations.actor_history", 6)]),
         ("g1_flat", [("observations.clip", 0.3), ("control.clip_actions", 0.25)]),
+        ("anymal_c_flat", [("control.held", ["HFE"]), ("observations.actor", UNJOINTED)]),
     ],
-    ids=["normalised", "history", "G1, clipped"],
+    ids=["normalised", "history", "G1, clipped", "held joints"],
 )
 def test_a_reader_of_mjlabs_metadata_does_what_the_policy_does(name, changes, tmp_path):
     task, runner, network = trained(name, *changes)
@@ -189,14 +190,16 @@ def test_a_reader_of_mjlabs_metadata_does_what_the_policy_does(name, changes, tm
     [
         ("go2_flat", [*ONE_FRAME, ("observations.actor_history", 3), ("control.action_scale", 0.1234)], GO2_MOTORS),
         ("g1_flat", ONE_FRAME, None),
+        ("g1_flat", [("control.held", ["shoulder", "elbow", "wrist"]), ("observations.actor", UNJOINTED)], None),
     ],
-    ids=["Go2, history", "G1"],
+    ids=["Go2, history", "G1", "G1, 15 actions"],
 )
 def test_a_reader_of_deploy_yaml_does_what_the_policy_does(name, changes, motors, tmp_path):
     task, runner, network = trained(name, *changes)
     export_as(task, network, tmp_path, "unitree")
     readers = [UnitreeReader(tmp_path, motors or task.robot.joint_names) for _ in range(2)]
-    assert readers[0].said["joint_ids_map"] == list(range(task.robot.num_dof))
+    assert readers[0].said["joint_ids_map"] == list(range(task.num_actions))
+    assert len(readers[0].said["stiffness"]) == len(readers[0].said["damping"]) == task.robot.num_dof
     assert readers[0].said["step_dt"] == pytest.approx(0.02)
     low, high = task.command_sampler.full_ranges[0].tolist()
     assert readers[0].said["commands"]["base_velocity"]["ranges"]["lin_vel_x"] == pytest.approx([low, high], abs=5e-4)
