@@ -48,7 +48,7 @@ UNLIMITED = 1e6
 
 
 def sdk_names(motors: int) -> tuple[str, ...] | None:
-    """Return the joints of Unitree's robot with this number of motors, in the motors' order; None if there is none."""
+    """Return the joints of Unitree's robot with this number of motors, sorted by motor, or None."""
     kind = next((kind for kind in KINDS.values() if len(kind.motors) == motors), None)
     return None if kind is None else tuple(kind.facts.joint_names[i] for i in np.argsort(kind.motors))
 

@@ -238,7 +238,7 @@ def test_the_metadata_have_mjlabs_keys_and_numbers(tmp_path):
             "anymal_c_flat",
             "mjlab",
             [("control.held", ["HAA"])],
-            r"control\.held: --format mjlab needs an action for each joint",
+            r"control\.held: --format mjlab knows only joints with an action, but 'dof_pos' has 12 numbers for 8 act",
         ),
         (
             "anymal_c_flat",
