@@ -1,8 +1,9 @@
 """The robot's program: `python -m legged.deploy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
-The program runs the exported policy in FOLDER (policy.onnx and policy.json) at the policy's rate. Commands come from the
-keyboard, a gamepad or a file. At its end the program writes a log. It needs numpy and onnxruntime, and for Unitree's robots
-also the extra `unitree-sdk2` of the package.
+The program runs the exported policy in FOLDER at the policy's rate. Beside policy.onnx, the folder has policy.json or Unitree's
+deploy.yaml, or the ONNX file has mjlab's metadata. Commands come from the keyboard, a gamepad or a file. At its end the program
+writes a log. It needs numpy and onnxruntime, for Unitree's robots also the extra `unitree-sdk2` of the package, and for
+deploy.yaml also PyYAML.
 """
 
 import argparse
