@@ -43,6 +43,8 @@ MJLAB_DT = 0.02
 """Control step of mjlab's tasks, if the metadata lack `fps` [s]."""
 CAUTIOUS = ((-0.5, 0.5), (-0.3, 0.3), (-0.5, 0.5))
 """Ranges of vx, vy [m/s] and yaw rate [rad/s], if the metadata lack `command_ranges`."""
+NEVER = 100.0
+"""Limits of at least this size are never reached, in SI units."""
 UNLIMITED = 1e6
 """Clip of observations and actions, which these formats lack."""
 
@@ -84,18 +86,15 @@ def _mjlab(path: Path, said: Mapping[str, str]) -> Contract:
     for name, scale, clip, history, flat in zip(names, *columns, strict=True):
         if history > 1 and not flat:
             raise ConfigError(f"{path}: observation_terms_flatten_history_dim: must be 1 for '{name}'")
-        bounds = None if np.isinf(clip).all() else clip
-        terms.append(_term(f"{path}: observation_names", name, MJLAB_TERMS, scale, bounds, history))
-    scales = numbers("action_scale")
+        terms.append(_term(f"{path}: observation_names", name, MJLAB_TERMS, scale, clip, history))
+    scales, ranges = numbers("action_scale"), numbers("command_ranges") if "command_ranges" in said else CAUTIOUS
     said_here = {
         "default_joint_angles": numbers("default_joint_pos"),
         "stiffness": numbers("joint_stiffness"),
         "damping": numbers("joint_damping"),
         "action_scale": scales if len(scales) > 1 else scales[0],
         "control_dt": 1.0 / float(said["fps"]) if "fps" in said else MJLAB_DT,
-        "command_ranges": dict(
-            zip(COMMANDS, numbers("command_ranges") if "command_ranges" in said else CAUTIOUS, strict=True)
-        ),
+        "command_ranges": dict(zip(COMMANDS, ranges, strict=True)),
     }
     return _contract(path, joints, terms, said_here)
 
@@ -111,8 +110,7 @@ def _unitree(path: Path, said: Mapping[str, Any]) -> Contract:
     if list(said["actions"]) != ["JointPositionAction"]:
         raise ConfigError(f"{path}: actions: must be JointPositionAction alone, got {', '.join(said['actions'])}")
     action, default = said["actions"]["JointPositionAction"], said["default_joint_pos"]
-    if action.get("clip") is not None:
-        raise ConfigError(f"{path}: actions.JointPositionAction.clip: must be null, got {action['clip']}")
+    _check_clip(f"{path}: actions.JointPositionAction", action.get("clip"))
     if np.shape(default) != (count,) or not np.allclose(action.get("offset") or 0.0, default, rtol=0.0, atol=1e-6):
         raise ConfigError(f"{path}: actions.JointPositionAction.offset: must be default_joint_pos, {count} numbers")
     observed, ranges = dict(said["observations"]), said["commands"]["base_velocity"]["ranges"]
@@ -137,9 +135,13 @@ def _term(where: str, name: str, terms: Mapping[str, str], scale: Any, clip: Any
     """Return our name, the scale (a number or a list) and the number of observations of the term `name`."""
     if name not in terms:
         raise ConfigError(f"{where}: '{name}' cannot be observed here{suggest(name, terms)}")
-    if clip is not None:
-        raise ConfigError(f"{where}: '{name}': the program clips no term, but the file has the limits {clip}")
+    _check_clip(f"{where}: '{name}'", clip)
     return {"name": terms[name], "scale": 1.0 if scale is None else scale, "history": max(1, int(history or 1))}
+
+
+def _check_clip(where: str, clip: Any) -> None:
+    if clip is not None and not (np.abs(clip) >= NEVER).all():
+        raise ConfigError(f"{where}: clip: this program clips only at {NEVER:g} and beyond, that is never; got {clip}")
 
 
 def _contract(

@@ -197,7 +197,7 @@ def test_rate_and_ranges_in_the_metadata_count(tmp_path):
         ({"observation_names": "command,joint_vel,action"}, r"'action' cannot be observed here; did you mean 'actions'\?"),
         (
             {"observation_terms_clip": "-inf;inf,-5.000;5.000,-inf;inf"},
-            r"'joint_vel': the program clips no term, but .* \[-5\.0",
+            r"'joint_vel': clip: this program clips only at 100 and beyond, .* got \[-5\.0",
         ),
         ({"observation_terms_flatten_history_dim": "1.000,0.000,1.000"}, r"flatten_history_dim: must be 1 for 'joint_vel'"),
         ({"anchor_body_name": "torso_link"}, r"anchor_body_name: the policy tracks motions"),
@@ -234,7 +234,7 @@ PLAIN = {"params": {}, "clip": None, "scale": None, "history_length": 1}
         ({"actions": {"JointVelocityAction": {}}}, r"actions: must be JointPositionAction alone, got JointVelocityAction"),
         (
             {"actions": {"JointPositionAction": {**ACTION, "clip": [-1.0, 1.0]}}},
-            r"JointPositionAction\.clip: must be null, got",
+            r"JointPositionAction: clip: this program clips only",
         ),
         (
             {"actions": {"JointPositionAction": {**ACTION, "offset": [0.0] * 12}}},
@@ -242,7 +242,10 @@ PLAIN = {"params": {}, "clip": None, "scale": None, "history_length": 1}
         ),
         ({"observations": {"gait_phase": PLAIN}}, r"observations: 'gait_phase' cannot be observed here"),
         ({"observations": {"base_lin_vel": PLAIN}}, r"observations: 'base_lin_vel' cannot be observed here"),
-        ({"observations": {"last_action": {**PLAIN, "clip": [-1, 1]}}}, r"'last_action': the program clips no term"),
+        (
+            {"observations": {"last_action": {**PLAIN, "clip": [-1, 1]}}},
+            r"'last_action': clip: this program clips only at 100",
+        ),
         (
             {
                 "observations": {
@@ -261,6 +264,12 @@ PLAIN = {"params": {}, "clip": None, "scale": None, "history_length": 1}
 def test_a_deploy_yaml_that_cannot_be_run_is_refused(changes, says, tmp_path):
     with pytest.raises(ConfigError, match=says):
         unitree_policy(tmp_path, **changes)
+
+
+def test_limits_that_are_never_reached_are_no_obstacle(tmp_path):
+    wide = {"actions": {"JointPositionAction": {**ACTION, "clip": [[-100.0, 100.0]] * 12}}}
+    observed = {name: {**entry, "clip": [-100, 100]} for name, entry in yaml.safe_load(UNITREE)["observations"].items()}
+    assert unitree_policy(tmp_path, **wide, observations=observed).contract.width == 30
 
 
 @pytest.mark.parametrize("text", ["", "[]", "a: [", "[" * 2000, "\x00"])
