@@ -13,6 +13,7 @@ from legged.errors import ConfigError
 from legged.learning.checkpoint import read_checkpoint
 from legged.learning.run_folder import checkpoints
 from legged.policies import export as exporting
+from legged.policies.formats import FORMATS, export_as
 from legged.policies.restore import policy_of, restore, undisturbed
 from legged.process.paths import ready_to_write, relative
 
@@ -20,12 +21,15 @@ from legged.process.paths import ready_to_write, relative
 @sub_command(
     "legged export go1_flat --out policies",
     "legged export anymal_c_flat/2026-11-22_05-38-19",
+    "legged export go2_real --format unitree",
     arguments=(
         *POLICY,
+        argument("--format", choices=FORMATS, default=FORMATS[0], help=f"program that reads the files; default {FORMATS[0]}"),
         argument(
             "--out",
             type=Path,
-            help="folder for the files; by default exported/ in the run folder (shipped policy: in logs/export/<task>)",
+            help="folder for the files; by default exported/ in the run folder (shipped policy: in logs/export/<task>), with"
+            " the format in its name if it is not legged",
         ),
     ),
 )
@@ -39,6 +43,9 @@ def export(args: argparse.Namespace) -> int:
 
     A policy that tracks motions has a file policy_<motion>.onnx besides, for each motion. `legged motion` reads the motion
     in this file, and `legged evaluate onnx` replays it.
+
+    With --format mjlab or unitree, each folder has a policy.onnx with mjlab's metadata, and for unitree a deploy.yaml. What
+    the format cannot express is an error.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:
@@ -49,7 +56,8 @@ def export(args: argparse.Namespace) -> int:
     paths = checkpoints(policy.folder)
     if not paths:
         raise ConfigError(f"POLICY: {relative(policy.folder)} contains no checkpoint")
-    folder = args.out or policy.output("export") / exporting.EXPORTED
+    suffix = "" if args.format == FORMATS[0] else f"_{args.format}"
+    folder = args.out or policy.output("export") / f"{exporting.EXPORTED}{suffix}"
     asked = policy_overrides(args)
     ready_to_write(folder, exporting.megabytes(override(policy.cfg, asked)) * len(paths))
     # An export simulates nothing. A task with one robot in C MuJoCo is built fastest, because it needs no kernels.
@@ -57,11 +65,13 @@ def export(args: argparse.Namespace) -> int:
     task, act = restore(policy, changes, device, graph=False)
     for path in paths.values():
         training: dict[str, float] = {"iterations": act.load(path)}
+        into = folder / f"{training['iterations']:05d}"
+        if args.format != FORMATS[0]:
+            export_as(task, act.network, into, args.format, relative(policy.folder))
+            continue
         seconds = read_checkpoint(path)["infos"].get("wall_s")
         if isinstance(seconds, int | float):
             training["wall_s"] = seconds
-        exporting.export(
-            task, act.network, folder / f"{training['iterations']:05d}", training, policy.cfg, relative(policy.folder)
-        )
+        exporting.export(task, act.network, into, training, policy.cfg, relative(policy.folder))
     print(f"exported {len(paths)} checkpoint{'s' if len(paths) != 1 else ''} to {relative(folder)}")
     return 0

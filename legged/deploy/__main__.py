@@ -1,8 +1,9 @@
 """The robot's program: `python -m legged.deploy FOLDER --robot udp:HOST:PORT|go2|g1`.
 
-The program runs the exported policy in FOLDER (policy.onnx and policy.json) at the policy's rate. Commands come from the
-keyboard, a gamepad or a file. At its end the program writes a log. It needs numpy and onnxruntime, and for Unitree's robots
-also the extra `unitree-sdk2` of the package.
+The program runs the exported policy in FOLDER at the policy's rate. Beside policy.onnx, the folder has policy.json or
+Unitree's deploy.yaml, or the ONNX file has mjlab's metadata. Commands come from the keyboard, a gamepad or a file. At its end
+the program writes a log. It needs numpy and onnxruntime, for Unitree's robots also the extra `unitree-sdk2` of the package,
+and for deploy.yaml also PyYAML.
 """
 
 import argparse
@@ -72,7 +73,7 @@ def build_parser() -> CommandParser:
         "python -m legged.deploy logs/deploy/anymal_c_proprio/exported --robot udp:127.0.0.1:40000",
         "python -m legged.deploy exported --robot go2 --network eth0 --input gamepad",
         arguments=(
-            argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and policy.json"),
+            argument("policy", type=Path, metavar="POLICY", help="folder with policy.onnx and its contract"),
             *PROGRAM,
             argument("--robot", required=True, help=f"udp:HOST:PORT, {' or '.join(KINDS)}"),
             argument("--network", help="network interface to a Unitree robot, e.g. eth0; found automatically by default"),
@@ -96,7 +97,7 @@ def _main(argv: list[str] | None) -> int:
     check_folder(args.log.parent)
     policy = Policy(args.policy)
     if args.robot in KINDS:  # refuse a wrong policy before UnitreeRobot ends the robot's own controller
-        policy.contract.check_fits(KINDS[args.robot].facts)
+        policy.fit(KINDS[args.robot].facts)
     operator = Interruptible(make_operator(args))
     tell = StatusMessages()
     hurries = take_priority()  # the threads of a robot's SDK start later, and inherit the priority

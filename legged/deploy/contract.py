@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +105,8 @@ class Term:
     """Largest observed depth of low ground [m]."""
     scan: str
     """Way to read the height map at a point, one of `SCANS`."""
+    joints: np.ndarray | None
+    """(size,) joints that the term shows, in its order; None: all joints in the contract's order, or no joints."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,8 @@ class Contract:
     """ONNX files beside policy.json with the policy and one motion each; empty for a policy that follows commands."""
     states: Mapping[str, tuple[int, int, int]]
     """Input of the ONNX file -> shape (layers, 1, width) of a hidden state; empty for a policy without memory."""
+    complete: bool = True
+    """False if the file states neither limits nor the IMU's body. `fitted` takes them from a robot."""
 
     @property
     def width(self) -> int:
@@ -195,6 +200,33 @@ class Contract:
         for key in sorted({*inside, *self.entries} - NOT_COMPARED):
             if key not in inside or key not in self.entries or inside[key] != self.entries[key]:
                 raise ConfigError(f"{self.path}: {key}: {network} has another value; the files are from different exports")
+
+    def fitted(self, robot: RobotFacts) -> "Contract":
+        """Return the contract after comparing it with a robot. If it is not complete, its joints are put into the robot's
+        order, and limits and the IMU's body are the robot's.
+
+        Raises:
+            ConfigError: `check_fits` refuses the robot.
+        """
+        contract = self
+        if not self.complete and set(self.joint_names) == set(robot.joint_names):
+            order = [self.joint_names.index(name) for name in robot.joint_names]
+            numbers = {"default_joint_angles": self.default, "stiffness": self.stiffness, "damping": self.damping}
+            contract = contract_of(
+                self.path,
+                {
+                    **self.entries,
+                    **{key: values[order].tolist() for key, values in numbers.items()},
+                    "position_limits": [x if math.isfinite(sum(x)) else None for x in robot.position_limits.tolist()],
+                    "velocity_limits": robot.velocity_limits.tolist(),
+                    "torque_limits": robot.torque_limits.tolist(),
+                    "joint_names": list(robot.joint_names),
+                    "robot": robot.name,
+                    "imu_frame": {"body": robot.imu_body},
+                },
+            )
+        contract.check_fits(robot)
+        return contract
 
     def check_fits(self, robot: RobotFacts) -> None:
         """Compare the contract with a robot.
@@ -238,7 +270,7 @@ def read_contract(path: Path, may_track: bool = False) -> Contract:
         ConfigError: the file cannot be read, has another version, describes a policy that this program cannot run, or has
             invalid values; or the checksum of an exported file is wrong.
     """
-    try:
+    with refusing(path, "policy.json of an export"):
         said = plain_json(path.read_bytes())
         if not isinstance(said, dict) or "observation" not in said:
             raise ConfigError(f"{path}: is no policy.json of an export (observation is missing)")
@@ -258,20 +290,32 @@ def read_contract(path: Path, may_track: bool = False) -> Contract:
             )
         if (control := said.get("control_type")) != "P":
             raise ConfigError(f"{path}: control_type: got {control!r}; a robot takes joint angles ('P') only")
-        contract = _contract(path, said)
+        contract = contract_of(path, said)
         for name, digest in said.get(CHECKSUMS, {}).items():
             file = path.with_name(name)
             if file.is_file() and hashlib.sha256(file.read_bytes()).hexdigest() != digest:
                 raise ConfigError(f"{file}: is not the file exported with {path} ({CHECKSUMS}); export the policy again")
+        return contract
+
+
+@contextmanager
+def refusing(path: Path, what: str) -> Iterator[None]:
+    """Turn the errors that a wrong file causes into the ConfigError that the file at `path` is no `what`."""
+    try:
+        yield
     except ConfigError:
         raise
     except (OSError, KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ConfigError(f"{path}: is no policy.json of an export ({text})") from error
-    return contract
+        raise ConfigError(f"{path}: is no {what} ({text})") from error
 
 
-def _contract(path: Path, entries: Mapping[str, Any]) -> Contract:
+def contract_of(path: Path, entries: Mapping[str, Any]) -> Contract:
+    """Return the contract with the entries of a policy.json, which an error calls `path`.
+
+    Raises:
+        ConfigError: an entry is invalid. Missing or malformed entries raise those errors that `refusing` turns into it.
+    """
     said = {**NO_COMMANDS, **entries} if "motion" in entries else entries
     joints, acted, memory = tuple(said["joint_names"]), said["action_joints"], said["recurrent"] or {"onnx_inputs": ()}
     count, scale = len(joints), said["action_scale"]
@@ -324,7 +368,7 @@ def _contract(path: Path, entries: Mapping[str, Any]) -> Contract:
         action_scale=np.broadcast_to(numbers("action_scale", *np.shape(scale)), (len(acted),)).copy(),
         action_clip=float(numbers("action_clip")),
         observation_clip=float(numbers("observation_clip")),
-        groups=tuple(_groups(f"{path}: observation", said, count)),
+        groups=tuple(_groups(f"{path}: observation", said)),
         command_ranges=ranges,
         dead_zone=float(numbers("command_dead_zone")),
         control_dt=float(control_dt),
@@ -335,9 +379,10 @@ def _contract(path: Path, entries: Mapping[str, Any]) -> Contract:
     )
 
 
-def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]:
-    """Yield the groups of terms. Refuse terms that do not fit a robot with `joints` joints, and gaps between columns."""
-    sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": joints, "dof_vel": joints}
+def _groups(where: str, said: Mapping[str, Any]) -> Iterator[Group]:
+    """Yield the groups of terms. Refuse terms that do not fit the robot's joints, and gaps between columns."""
+    joints = list(said["joint_names"])
+    sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": len(joints), "dof_vel": len(joints)}
     sizes["actions"] = len(said["action_joints"])
     names = [entry["name"] for entry in said["observation_groups"]]
     for entry in said["observation"]:
@@ -351,7 +396,7 @@ def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]
         if entry["start"] != start:
             raise ConfigError(f"{where}_groups: '{entry['name']}' must start at column {start}, got {entry['start']}")
         own = [term for term in said["observation"] if term["group"] == entry["name"]]
-        terms = sorted((_term(where, term, sizes) for term in own), key=lambda term: term.start)
+        terms = sorted((_term(where, term, sizes, joints) for term in own), key=lambda term: term.start)
         for term in terms:
             if term.start != column:
                 raise ConfigError(f"{where}: '{term.name}' must start at column {column}, got {term.start}")
@@ -362,15 +407,17 @@ def _groups(where: str, said: Mapping[str, Any], joints: int) -> Iterator[Group]
         start += size * history
 
 
-def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Term:
+def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int], joints: list[str]) -> Term:
     name, needs, size, limit = str(entry["name"]), str(entry["needs"]), int(entry["size"]), entry.get("limit", np.inf)
     source = needs.removeprefix(SOURCE) if needs.startswith(SOURCE) else None
     scale, points = np.array(entry["scale"], dtype=float), np.array(entry.get("points") or (), dtype=float).reshape(-1, 2)
     scan = str(entry.get("scan", SCANS[0]))
     if source is None and needs != SENSORS.get(name):
         raise ConfigError(f"{where}: '{name}' cannot be made from '{needs}'")
-    if source is None and size != sizes[name]:
-        raise ConfigError(f"{where}: '{name}' has {size} numbers, but a robot gives {sizes[name]}")
+    shown = entry.get("joints") if name in ("dof_pos", "dof_vel") else None
+    given = sizes.get(name) if shown is None else len(shown)
+    if source is None and size != given:
+        raise ConfigError(f"{where}: '{name}' has {size} numbers, but a robot gives {given}")
     if scale.shape != (size,) or not np.isfinite(scale).all():
         raise ConfigError(f"{where}: scale of '{name}': must be {size} finite numbers, got {entry['scale']}")
     if source == "heights" and len(points) != size:
@@ -388,6 +435,7 @@ def _term(where: str, entry: Mapping[str, Any], sizes: Mapping[str, int]) -> Ter
         limit=float(limit),
         deepest=float(entry.get("deepest", limit)),
         scan=scan,
+        joints=None if shown is None else np.array([joints.index(joint) for joint in shown]),
     )
 
 

@@ -12,7 +12,8 @@ import onnxruntime
 
 from legged.deploy.contract import Contract, read_contract
 from legged.deploy.errors import ConfigError
-from legged.deploy.interface import Reading
+from legged.deploy.interface import Reading, RobotFacts
+from legged.deploy.other_formats import read_other
 
 WARM_UP = 20
 """Number of trial runs after the network is loaded. The first runs of a network take ten times as long as later runs."""
@@ -102,18 +103,22 @@ class Network:
             ConfigError: the file cannot be read, has other sizes than the contract, comes from another export than the
                 contract, gives actions that are not finite, or needs too much time or memory.
         """
-        self._session, self._states = open_onnx(path), contract.states
-        contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
-        wanted: dict[str, tuple[int, ...]] = {"obs": (contract.width,)}
+        self._session, self._states, said = open_onnx(path), contract.states, contract.path.name
+        if contract.complete:
+            contract.check_metadata(path, self._session.get_modelmeta().custom_metadata_map)
+        inputs = self._session.get_inputs()
+        self._input = "obs" if contract.complete else inputs[0].name
+        wanted: dict[str, tuple[int, ...]] = {self._input: (contract.width,)}
         wanted |= {name: (layers, width) for name, (layers, _, width) in contract.states.items()}
-        found = {each.name: tuple(n for n in each.shape if isinstance(n, int)) for each in self._session.get_inputs()}
-        if list(found.items()) != list(wanted.items()):  # the batch size is a name, so `found` lacks it
-            raise ConfigError(f"{path}: has the inputs {found}, but policy.json says {wanted}")
+        # The batch size is the first axis of an observation. In a hidden state it is a name, and no number.
+        found = {each.name: tuple(n for n in each.shape[len(each.shape) == 2 :] if isinstance(n, int)) for each in inputs}
+        if list(found.items()) != list(wanted.items()):
+            raise ConfigError(f"{path}: has the inputs {found}, but {said} says {wanted}")
         self.restart()
         zeros = np.zeros((1, contract.width), dtype=np.float32)
-        actions = np.asarray(warm_up(path, self._session, {"obs": zeros, **self._hidden})[0])[0]
+        actions = np.asarray(warm_up(path, self._session, {self._input: zeros, **self._hidden})[0])[0]
         if actions.shape != contract.acted.shape:
-            raise ConfigError(f"{path}: gives {actions.size} actions, but policy.json says {len(contract.acted)}")
+            raise ConfigError(f"{path}: gives {actions.size} actions, but {said} says {len(contract.acted)}")
         if not np.isfinite(actions).all():
             raise ConfigError(f"{path}: gives actions that are not finite for an observation of zeros")
 
@@ -123,7 +128,7 @@ class Network:
 
     def run(self, observation: np.ndarray) -> np.ndarray:
         """Return the actions (A,) float32 for an observation (width,) float32."""
-        actions, *hidden = self._session.run(None, {"obs": observation[None], **self._hidden})
+        actions, *hidden = self._session.run(None, {self._input: observation[None], **self._hidden})
         self._hidden = dict(zip(self._hidden, hidden, strict=False))
         return np.asarray(actions)[0]
 
@@ -132,21 +137,34 @@ class Policy:
     """A policy that controls one robot. Every `contract.control_dt` it converts a reading and a command to joint targets."""
 
     def __init__(self, folder: Path) -> None:
-        """Load the export in `folder`, which may also be the path of its policy.onnx.
+        """Load the export in `folder`, which may also be the path of its policy.onnx. Without a policy.json, the contract is
+        Unitree's deploy.yaml, or the metadata that mjlab gives its ONNX files.
 
         Raises:
             ConfigError: there is no export, or this program cannot run it.
         """
         path = folder if folder.suffix == ".onnx" else folder / "policy.onnx"
-        for needed in (path, path.with_name("policy.json")):
-            if not needed.is_file():
-                raise ConfigError(f"POLICY: there is no {needed}; name a folder with policy.onnx and policy.json")
-        self.contract = contract = read_contract(path.with_name("policy.json"))
+        said = path.with_name("policy.json")
+        if not path.is_file():
+            raise ConfigError(f"POLICY: there is no {path}; name a folder with policy.onnx and policy.json")
+        if said.is_file():
+            contract = read_contract(said)
+        else:
+            contract = read_other(path, open_onnx(path).get_modelmeta().custom_metadata_map)
+        self.contract = contract
         self._network = Network(path, contract)
         self._steps = [np.zeros((group.history, group.size)) for group in contract.groups]
         self.observation = np.zeros(contract.width, dtype=np.float32)
         """(width,) observation of the last call of `act`."""
         self.restart()
+
+    def fit(self, robot: RobotFacts) -> None:
+        """Take from a robot what the contract leaves open.
+
+        Raises:
+            ConfigError: the policy does not fit the robot.
+        """
+        self.contract = self.contract.fitted(robot)
 
     def restart(self) -> None:
         """Clear the hidden state, the last action and the histories. The next observation then fills each history, as
@@ -188,6 +206,8 @@ class Policy:
             steps[:-1] = steps[1:]
             for term in group.terms:
                 value = values[term.name] if term.source is None else reading.sources[term.source]
+                if term.joints is not None:
+                    value = value[term.joints]
                 if term.source == "heights":
                     value = np.clip(-value - term.offset, -term.limit, term.deepest)
                 begin = term.start - group.start

@@ -58,7 +58,7 @@ class Program:
         Raises:
             ConfigError: the policy does not fit the robot.
         """
-        policy.contract.check_fits(robot.facts)
+        policy.fit(robot.facts)
         self._policy, self._robot, self._operator = policy, robot, operator
         self._contract = contract = policy.contract
         self._stand_s, self._clock, self._sleep, self._tell = stand_s, clock, sleep, tell

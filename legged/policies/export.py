@@ -100,12 +100,13 @@ def export(
         return policy(TensorDict(groups, batch_size=[len(step)]))
 
     # Files are made and checked in memory, because torch aborts the process if the disk is full.
+    texts = {key: json.dumps(value) for key, value in metadata.items()}
     hidden = policy.get_hidden_state()
     try:
         policy.to("cpu").eval()
         policy.reset()
         wanted = _actions(act, policy.reset, observations, begins)
-        files = {"policy.pt": _torchscript(policy), "policy.onnx": _onnx(policy, metadata)}
+        files = {"policy.pt": _torchscript(policy), "policy.onnx": onnx_of(policy, texts)}
         files["policy.weights"] = weights_of(policy, task.cfg.train.policy.activation, task.num_actions)
     finally:
         policy.to(device)
@@ -215,8 +216,8 @@ def _torchscript(policy: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
-    """Return the ONNX file of a policy, for any batch size. Its metadata has the keys of `metadata`, with values as JSON."""
+def onnx_of(policy: Any, metadata: Mapping[str, str], free: bool = True) -> bytes:
+    """Return the ONNX file of `policy`, rsl-rl's actor network, with texts as metadata. Its batch is `free`, or of size 1."""
     module = policy.as_onnx(verbose=False).to("cpu").eval()
     buffer = io.BytesIO()
     inputs, outputs = module.input_names, module.output_names
@@ -231,11 +232,11 @@ def _onnx(policy: Any, metadata: dict[str, Any]) -> bytes:
             opset_version=18,
             input_names=inputs,
             output_names=outputs,
-            dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}, **hidden},
+            dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}, **hidden} if free else None,
             dynamo=False,
         )
     model = onnx.load_from_string(buffer.getvalue())
-    onnx.helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
+    onnx.helper.set_model_props(model, dict(metadata))
     onnx.checker.check_model(model)
     return model.SerializeToString()
 

@@ -204,9 +204,10 @@ def test_files_of_two_exports_are_refused(folder, tmp_path):
 def test_folders_without_an_export_are_refused(folder, tmp_path):
     with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.onnx"):
         Policy(tmp_path)
-    (tmp_path / "policy.onnx").write_bytes(b"no network")
-    with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.json"):
+    (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
+    with pytest.raises(ConfigError, match=r"POLICY: there is no .*policy\.json, no deploy\.yaml, and policy\.onnx has no"):
         Policy(tmp_path)
+    (tmp_path / "policy.onnx").write_bytes(b"no network")
     changed(folder, tmp_path, sha256=None)
     with pytest.raises(ConfigError, match=r"policy\.onnx: onnxruntime cannot read it"):
         Policy(tmp_path)

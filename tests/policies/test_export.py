@@ -116,7 +116,7 @@ def test_the_metadata_says_what_a_controller_must_know(exported, runner):
 @pytest.mark.slow
 @pytest.mark.parametrize("file", ["policy.pt", "policy.onnx", "policy.weights"])
 def test_an_export_that_computes_something_else_is_refused_by_name(runner, tmp_path, monkeypatch, file):
-    function = {"policy.pt": "_torchscript", "policy.onnx": "_onnx", "policy.weights": "weights_of"}[file]
+    function = {"policy.pt": "_torchscript", "policy.onnx": "onnx_of", "policy.weights": "weights_of"}[file]
     write = getattr(export_module, function)
 
     def write_another(policy, *rest):
