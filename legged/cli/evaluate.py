@@ -32,7 +32,7 @@ from legged.evaluation.result_file import CHANGED, changes_of
 from legged.evaluation.stress.disturbances import NAMES
 from legged.evaluation.stress.measuring import RISER, TREAD, Bench, evaluate_stress
 from legged.evaluation.success import TYPES_HELP, chosen_sizes
-from legged.evaluation.trackers import EPISODES, Tracker
+from legged.evaluation.trackers import Tracker
 from legged.evaluation.velocity_grid import AXES, AXIS, MOST_ROBOTS, Grid, axes_of, axis_values, check_size
 from legged.learning.run_folder import CONFIG_FILE
 from legged.policies.foreign import ForeignPolicy, Layout, read_layout, was_trained_with_other_motors
@@ -333,6 +333,8 @@ MOST_CELLS = 10_000
 """Largest number of commands of a grid. It is limited because a single robot follows all commands, one after another."""
 FRICTION = 0.8
 """Default friction between robot and ground."""
+EPISODES = 128
+"""Number of robots that begin in random frames of a tracker's motion."""
 RESULT = "onnx.json"
 EXPORTED = ("policy.onnx", "policy.json")
 """Files of an exported folder: the network, and its description."""
@@ -423,7 +425,7 @@ def _replay(files: list[Path], layouts: list[Layout], args: argparse.Namespace) 
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option}: has no effect on a tracker, whose layout names a task")
     result = [
-        Tracker(tracker, layout).measure()
+        Tracker(tracker, layout, EPISODES).measure()
         for path, layout in zip(files, layouts, strict=True)
         for tracker in _trackers(path, layout)
     ]

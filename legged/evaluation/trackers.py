@@ -18,15 +18,13 @@ from legged.policies.restore import nominal, undisturbed
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
 
-EPISODES = 128
-"""Robots that begin in random frames of a tracker's motion."""
 INPUTS, ACTIONS = ("obs", "time_step"), "actions"
 
 
 class Tracker:
     """A tracker on the robots of a task, in C MuJoCo."""
 
-    def __init__(self, path: Path, layout: Layout, episodes: int = EPISODES) -> None:
+    def __init__(self, path: Path, layout: Layout, episodes: int) -> None:
         """Load the ONNX file at `path`, and build the task that its layout names, with the file's motion and gains and with
         `episodes` robots.
 

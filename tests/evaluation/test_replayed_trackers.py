@@ -100,15 +100,16 @@ def test_joints_may_have_another_order():
     torch.testing.assert_close(*found, atol=1e-4, rtol=1e-3)
 
 
-def test_the_command_prints_and_writes_what_it_found(capsys):
+def test_the_command_prints_and_writes_what_it_found(capsys, monkeypatch):
+    monkeypatch.setattr("legged.cli.evaluate.EPISODES", 4)
     tracker_file()
     Path("mine.yaml").write_text(f"task: g1_tracking\nobservation: {json.dumps(TERMS)}\naction_scale: 1.0\n")
     assert main(["evaluate", "onnx", "tracker.onnx", "--layout", "mine.yaml", "--out", "out"]) == 0
     assert "falls at" in (printed := capsys.readouterr().out)
-    assert "128 episodes of 10 s" in printed
+    assert "4 episodes of 10 s" in printed
     (row,) = json.loads(Path("out/onnx.json").read_text())["trackers"]
     assert row["file"] == "tracker.onnx"
-    assert row["episodes"] == 128
+    assert row["episodes"] == 4
     assert not row["whole"]["success"]
 
 
@@ -122,7 +123,7 @@ def test_the_command_prints_and_writes_what_it_found(capsys):
 )
 def test_a_file_that_does_not_fit_is_named(inputs, changes, message):
     with pytest.raises(ConfigError, match=message):
-        Tracker(tracker_file(inputs=inputs), layout(**changes))
+        Tracker(tracker_file(inputs=inputs), layout(**changes), 1)
 
 
 @pytest.mark.parametrize(

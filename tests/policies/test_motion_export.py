@@ -14,11 +14,14 @@ import legged.policies.export as export_module
 from legged.cli import main as commands
 from legged.deploy.__main__ import main as robot_program
 from legged.envs.motion_tracking import ERRORS
+from legged.evaluation.measurement import Overflows
+from legged.evaluation.motions import ENDLESS_S, measure_motion, on_the_motion
 from legged.learning.runner import Runner
 from legged.motion.kinematics import Skeleton
 from legged.motion.readers import read_clip
 from legged.policies.export import ExportError, export
 from legged.policies.motion_export import OUTPUTS
+from legged.policies.restore import nominal, undisturbed
 from legged.process.paths import data_folder
 from legged.registry import make_task, task_config
 from legged.robots.robot import load_robot
@@ -67,22 +70,22 @@ def session_of(path: Path) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
 
 
-@torch.no_grad()
-def from_the_beginning(clip: str, act, **settings) -> dict[str, float]:
-    """How long a policy tracks a clip, and its mean errors, by the task's own observations."""
-    changes = {
-        **EXACT,
-        "motion.files": [str(CLIPS / f"{clip}.npz")],
-        "env.num_envs": 1,
-        "env.episode_length_s": 1e4,
-        **settings,
-    }
-    task = make_task(task_config("g1_tracking", [*changes.items()], on_cpu=True))
-    observations, errors = task.start_at(torch.zeros_like(task.motion.frame)), []
-    while len(errors) < len(task.motion.table.rows) - 1 and not task.terminated_buf[0]:
-        observations, *_ = task.step(act(observations))
-        errors.append(task.errors[0].clone())
-    return {"lasted_s": len(errors) * task.dt, **dict(zip(ERRORS, torch.stack(errors).mean(dim=0).tolist(), strict=True))}
+@pytest.fixture
+def few_episodes(monkeypatch) -> None:
+    """Trackers are measured with four robots."""
+    monkeypatch.setattr("legged.cli.evaluate.EPISODES", 4)
+
+
+def measured(clip: str, act, **settings) -> dict[str, float]:
+    """How well a policy tracks a clip, by the task's own observations."""
+    cfg = task_config("g1_tracking", [("sim.physics", "mujoco"), *settings.items()], on_cpu=True)
+    clips = ("motion.files", [str(CLIPS / f"{clip}.npz")])
+    task = make_task(nominal(cfg, [*undisturbed(cfg, 4, ENDLESS_S), *on_the_motion(), clips]))
+    return figures(measure_motion(task, act, Overflows()))
+
+
+def figures(found: dict) -> dict[str, float]:
+    return {"lasted_s": found["whole"]["lasted_s"], **{key: found[key] for key in ("successes", *ERRORS)}}
 
 
 def frame_of(session: onnxruntime.InferenceSession, step: float) -> dict[str, np.ndarray]:
@@ -182,21 +185,20 @@ def test_the_motion_is_read_back(folder, capsys):
 
 
 @pytest.mark.slow
-def test_a_replay_does_what_the_policy_does(runner, folder, capsys):
+def test_a_replay_does_what_the_policy_does(runner, folder, few_episodes):
     """Both trackers of the folder are replayed. Each gives the errors of the policy in a task with this motion alone."""
     assert commands.main(["evaluate", "onnx", str(folder), "--out", "."]) == 0
     rows = json.loads(Path("onnx.json").read_text())["trackers"]
     assert [Path(row["file"]).name for row in rows] == ["policy_squat.onnx", "policy_kick.onnx"]
     act = runner.get_inference_policy("cpu")
     for row, clip in zip(rows, ("squat", "kick"), strict=True):
-        found = from_the_beginning(clip, act)
-        assert {key: row[key] for key in found} == pytest.approx(found, rel=1e-3)
+        assert figures(row) == pytest.approx(measured(clip, act), rel=1e-3)
     assert commands.main(["evaluate", "onnx", str(folder / "policy_kick.onnx"), "--out", "."]) == 0
     assert json.loads(Path("onnx.json").read_text())["trackers"] == rows[1:]
 
 
 @pytest.mark.slow
-def test_a_replay_takes_rates_and_bodies_from_the_export():
+def test_a_replay_takes_rates_and_bodies_from_the_export(few_episodes):
     """At 100 Hz, with observations that are scaled and clipped, and other bodies, without the base."""
     bodies = ["torso_link", "left_ankle_roll_link", "right_ankle_roll_link"]
     own = {"control.decimation": 2, "observations.scales": {"dof_vel": 0.05}, "observations.clip": 1.0}
@@ -208,8 +210,7 @@ def test_a_replay_takes_rates_and_bodies_from_the_export():
     np.testing.assert_allclose(clip.root_pos, runner.env.motion.clips["squat"].root_pos, atol=1e-5)
     assert commands.main(["evaluate", "exported", "--out", "."]) == 0
     (row,) = json.loads(Path("onnx.json").read_text())["trackers"]
-    found = from_the_beginning("squat", runner.get_inference_policy("cpu"), **own)
-    assert {key: row[key] for key in found} == pytest.approx(found, rel=1e-3)
+    assert figures(row) == pytest.approx(measured("squat", runner.get_inference_policy("cpu"), **own), rel=1e-3)
     assert row["seconds"] == pytest.approx(5.5, abs=0.02)
 
 
