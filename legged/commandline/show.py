@@ -151,9 +151,14 @@ def _pushes(rand: RobotDomainRandConfig) -> Iterator[tuple[str, str, str]]:
         size = ", ".join(f"{axis} {_span(getattr(kick, axis), unit)}" for axis, unit in parts if any(getattr(kick, axis)))
         yield name, f"adds to the base's velocity: {size}", f"every {_span(kick.interval_s, 's')}{_grown(kick.grow)}"
     for name, force in rand.forces.items():
-        size = ", ".join(f"{axis} {_span(getattr(force, axis), 'N')}" for axis in "xyz" if any(getattr(force, axis)))
+        given = [axis for axis in ("x", "y", "z", "size") if any(getattr(force, axis))]
+        size = ", ".join(f"{axis} {_span(getattr(force, axis), 'N')}" for axis in given)
+        place = f"a joint of {', '.join(force.joints)}" if force.joints else force.body or "the base"
         moments = f"for {_span(force.duration_s, 's')}, every {_span(force.interval_s, 's')}{_grown(force.grow)}"
-        yield name, f"force on {force.body or 'the base'}: {size}", moments
+        yield name, f"force on {place}: {size}", moments
+    if (goals := rand.held_goals).step:
+        change = f"goals of held joints change by sigma {_number(goals.step)} rad{', mirrored' if goals.mirrored else ''}"
+        yield "held_goals", change, f"every {_number(goals.period_s)} s{_grown(goals.grow)}"
 
 
 def _actions(task: BaseTask) -> Iterator[str]:
@@ -186,7 +191,8 @@ def _effect(task: BaseTask, i: int) -> str:
     p, d, limit = (float(control.nominal[name][i]) for name in ("p_gain", "d_gain", "torque_limit"))
     scales = dict(zip(control.acted, action_scales(task.robot, law).tolist(), strict=True))
     if i not in scales:
-        target = f"position {float(task.default_dof_pos[i]):g} [rad], held"
+        goal = " + its goal" if task.cfg.domain_rand.held_goals.step else ""
+        target = f"position {float(task.default_dof_pos[i]):g}{goal} [rad], held"
     elif control.laws[i] == "P":
         target = f"position {float(task.default_dof_pos[i]):g} + {scales[i]:g} a [rad]"
     else:

@@ -27,7 +27,7 @@ from legged.config.mdp import (
     RewardsConfig,
     TerminationsConfig,
 )
-from legged.config.randomization import DrawConfig, ForceConfig, KickConfig
+from legged.config.randomization import DrawConfig, ForceConfig, HeldGoalsConfig, KickConfig
 from legged.config.section import Section
 from legged.config.task import TaskConfig
 
@@ -109,7 +109,8 @@ class RobotControlConfig(ControlConfig):
     """Scale of the actions: one number, or joint-name pattern -> number. Law P: target = action_scale * action + default
     angle [rad]. Laws V and T: target = action_scale * action [rad/s] or [N m]."""
     held: tuple[str, ...] = field(default=(), metadata=TERMS)
-    """Name patterns of joints without an action. These joints need law P: their gains hold them at their default angles."""
+    """Name patterns of joints without an action. These joints need law P: their gains hold them at their default angles, or
+    at moving goals (domain_rand.held_goals)."""
     actuator: ActuatorConfig = field(default_factory=ActuatorConfig)
     """Properties of real motors: torque limits that depend on speed, friction, delay, learned actuator models."""
 
@@ -160,7 +161,8 @@ class RobotDomainRandConfig(DomainRandConfig):
     """Any name -> sudden changes of the base's velocity. A kick adds to the velocity that push_robots has set."""
     forces: dict[str, ForceConfig] = field(default_factory=dict)
     """Any name -> a temporary force on a body of the robot."""
-
+    held_goals: HeldGoalsConfig = field(default_factory=HeldGoalsConfig)
+    """Random walk of the joints without an action."""
     observed_forces: dict[str, ForceConfig] = field(default_factory=dict)
     """Any name -> a force that is observed (`_obs_push_force`) but does not act. Play and evaluation move the entries of
     `forces` to this setting, so that the observation keeps its size and scale."""
@@ -174,7 +176,8 @@ class RobotDomainRandConfig(DomainRandConfig):
             by_flag["added_base_mass"] = self.added_mass_range
         ranges = {**by_flag, **plain.observed_ranges}
         forces = {**self.observed_forces, **self.forces}
-        return replace(plain, kicks={}, forces={}, observed_ranges=ranges, observed_forces=forces)
+        still = HeldGoalsConfig()
+        return replace(plain, kicks={}, forces={}, held_goals=still, observed_ranges=ranges, observed_forces=forces)
 
 
 @dataclass(frozen=True)
@@ -249,6 +252,8 @@ class RobotObservationsConfig(ObservationsConfig):
         metadata=rescaled_by_entry("_obs_", between(0, LARGEST)),
     )
     """Term -> half width of its uniform noise, in the term's unit before scaling."""
+    joints: tuple[str, ...] = field(default=(), metadata=TERMS)
+    """Name patterns of the joints that the terms `dof_pos` and `dof_vel` observe; empty for all joints."""
     heights_offset: float = field(default=0.5, metadata=rescaled("m", between(-100, 100)))
     """An observed height is 0 if the ground is this far below the base [m]."""
     heights_limit: float = field(default=1.0, metadata=rescaled("m", positive(100)))

@@ -9,10 +9,12 @@ from legged.config.randomization import draw_of
 from legged.config.robot import RobotConfig
 from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed
 from legged.envs.randomization_checks import check_disturbances
+from legged.envs.robot_terms import observed_joints
 from legged.errors import ConfigError, suggest
 from legged.mdp.actuators.actuator import check_actuator
 from legged.mdp.actuators.motor_curve import check_motor_model, check_slowest
 from legged.mdp.control import acted_joints, action_scales, check_wheels, control_gains
+from legged.mdp.held_goals import held_walk
 from legged.mdp.mirror_images import MirrorKind, mirror_of_actions
 from legged.physics.fields import FIELDS
 from legged.robots.robot import Robot
@@ -42,6 +44,9 @@ def check_legged(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
         check_slowest(robot, cfg.control, cfg.sim.dt, lowest, cfg.origins.where)
     check_terrain(cfg.terrain, cfg.origins)
     check_disturbances(cfg, robot)
+    if cfg.domain_rand.held_goals.step:
+        held_walk(cfg.domain_rand.held_goals, robot, cfg.control, cfg.origins.where)
+    observed_joints(robot, cfg.observations.joints, cfg.origins.where)
     check_robot(cfg, robot)
 
 
@@ -68,6 +73,10 @@ def check_symmetry(cls: Any, cfg: RobotConfig, robot: Robot) -> None:
     image = mirror_of_actions(robot.mirror, acted)
     if image is None:
         raise origins.error("control.held", f"joints are held on one side only; {otherwise} ({origins.where(path)})")
+    if mirror_of_actions(robot.mirror, observed_joints(robot, cfg.observations.joints, origins.where)) is None:
+        raise origins.error(
+            "observations.joints", f"joints are observed on one side only; {otherwise} ({origins.where(path)})"
+        )
     laws = robot.each(cfg.control.control_type, origins.where("control.control_type"))[list(acted)].tolist()
     scales = action_scales(robot, cfg.control, origins.where).tolist()
     for field, values in (("control_type", laws), ("action_scale", scales)):
@@ -119,8 +128,8 @@ def check_mirrored_draw(cfg: RobotConfig, robot: Robot, name: str) -> None:
 
 
 def check_robot(cfg: RobotConfig, robot: Robot) -> None:
-    """Check that passive joints are observed only if the robot has some, that self-collisions are punished only if they are
-    simulated, that the lightest base that can be drawn has a positive mass, and that the height scan fits in memory.
+    """Check that passive and held joints are observed only if the robot has some, that self-collisions are punished only if
+    they are simulated, that the lightest base that can be drawn has a positive mass, and that the height scan fits in memory.
 
     Raises:
         ConfigError: one of these is not so.
@@ -130,6 +139,8 @@ def check_robot(cfg: RobotConfig, robot: Robot) -> None:
             if term in ("passive_pos", "passive_vel") and (robot.passive is None or not robot.passive.names):
                 text = f"{term}: '{robot.name}' has no passive hinges or slides (passive_joints)"
                 raise cfg.origins.error(path_of_terms(cfg, group), text)
+            if term == "held_targets" and not cfg.control.held:
+                raise cfg.origins.error(path_of_terms(cfg, group), f"{term}: control.held names no joints")
     if cfg.rewards.scales.get("self_collision") and not cfg.sim.self_collisions:
         text = "shapes of the robot only collide with each other with sim.self_collisions=true, got false"
         raise cfg.origins.error("rewards.scales.self_collision", text)

@@ -60,6 +60,8 @@ class MotionTracking(RobotTask):
             raise ConfigError(f"{where('robot')}: '{robot.name}' has joints without a motor, which no reference moves")
         if cfg.terrain.mesh_type != "plane":
             raise ConfigError(f"{where('terrain.mesh_type')}: motions are tracked on a plane, got '{cfg.terrain.mesh_type}'")
+        if cfg.observations.joints:
+            raise ConfigError(f"{where('observations.joints')}: an exported tracker observes all joints; remove the setting")
         skeleton = Skeleton(robot)
         skeleton.indices(motion.bodies, where("motion.bodies"))
         if not motion.extremities:

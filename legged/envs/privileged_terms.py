@@ -66,7 +66,7 @@ def observed_forces(cfg: RobotConfig) -> dict[str, ForceConfig]:
 
 def largest_of(force: ForceConfig) -> float:
     """Return the largest absolute value that can be drawn for a component [N]. Observed forces are divided by this value."""
-    return max(abs(end) for axis in (force.x, force.y, force.z) for end in axis)
+    return max(abs(end) for axis in (force.x, force.y, force.z, force.size) for end in axis)
 
 
 def observed(cfg: Any, name: str) -> DrawConfig | None:

@@ -10,6 +10,7 @@ from legged.envs.privileged_terms import MIRROR_KINDS, PREFIX, observed, observe
 from legged.errors import ConfigError, suggest
 from legged.physics.fields import FIELDS
 from legged.physics.scene.robot_scene import body_names
+from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
 
 Error = Callable[[str, str], ConfigError]
@@ -117,15 +118,16 @@ def _check_derived(cfg: TaskConfig) -> None:
 
 
 def check_disturbances(cfg: RobotConfig, robot: Robot) -> None:
-    """Check kicks and forces.
+    """Check kicks, forces, and the growth of held joints' goals.
 
     Raises:
-        ConfigError: a kick or force has no effect, has an invalid `grow`, or names a body that the robot does not have.
+        ConfigError: a kick or force has no effect, has an invalid `grow`, or names a body or joint that the robot does not
+            have; or a force has two places or two sizes.
     """
     error, rand = cfg.origins.error, cfg.domain_rand
     for table, axes, text in (
         ("kicks", ("x", "y", "z", "roll", "pitch", "yaw"), "it kicks nothing; give a range for x, y, z, roll, pitch or yaw"),
-        ("forces", ("x", "y", "z"), "it pushes nothing; give a range for x, y or z [N]"),
+        ("forces", ("x", "y", "z", "size"), "it pushes nothing; give a range for x, y or z, or for size [N]"),
     ):
         for name, entry in getattr(rand, table).items():
             path = f"domain_rand.{table}.{name}"
@@ -133,10 +135,18 @@ def check_disturbances(cfg: RobotConfig, robot: Robot) -> None:
             if all(getattr(entry, axis) == (0.0, 0.0) for axis in axes):
                 raise error(path, text)
     bodies = body_names(robot) if rand.forces else ()
+    _check_grow(rand.held_goals.grow, "domain_rand.held_goals", error)
     for name, force in rand.forces.items():
+        path = f"domain_rand.forces.{name}"
+        if force.size != (0.0, 0.0) and any(getattr(force, axis) != (0.0, 0.0) for axis in "xyz"):
+            raise error(f"{path}.size", "a force of any direction has no x, y and z; remove either them or size")
+        if force.joints and force.body:
+            raise error(f"{path}.joints", f"the force acts on the body '{force.body}' already; remove either body or joints")
+        if force.joints:
+            match_names(force.joints, robot.joint_names, cfg.origins.where(f"{path}.joints"))
         if force.body and force.body not in bodies:
             unknown = f"'{robot.name}' has no body '{force.body}'{suggest(force.body, bodies, 'bodies')}"
-            raise error(f"domain_rand.forces.{name}.body", unknown)
+            raise error(f"{path}.body", unknown)
 
 
 def check_observed(cfg: TaskConfig) -> None:
@@ -174,7 +184,7 @@ def _why_force_unobserved(cfg: RobotConfig) -> str:
     forces = observed_forces(cfg)
     if not forces:
         return "domain_rand.forces names no force to observe"
-    aside = next((force.body for force in forces.values() if force.body), "")
+    aside = next((force.body or ", ".join(force.joints) for force in forces.values() if force.body or force.joints), "")
     if not aside or not cfg.train.algorithm.symmetry:
         return ""
     reason = f"a force on '{aside}' has no mirror image, because only forces on the base have one"

@@ -13,13 +13,14 @@ from legged.config.robot import RobotConfig, has_robot
 from legged.config.task import TaskConfig
 from legged.envs.base_task import BaseTask
 from legged.envs.legged_checks import check_legged
-from legged.envs.robot_terms import RobotTerms
+from legged.envs.robot_terms import RobotTerms, observed_joints
 from legged.math import evenly_spaced, quat_rotate
 from legged.mdp.actuators.motor_curve import with_rotors
 from legged.mdp.contacts import FeetContacts, contact_force
 from legged.mdp.control import Control, acted_joints
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors, is_exact
+from legged.mdp.held_goals import HeldGoals
 from legged.mdp.mirror_images import MirrorImages
 from legged.mdp.randomization import Pushes, RobotRandomization
 from legged.mdp.sensors import ContactForces, HeightScan, Sensor
@@ -123,8 +124,13 @@ class RobotTask(RobotTerms, BaseTask):
 
         self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
         steps = cfg.train.runner.num_steps_per_env
-        self.disturbances = Disturbances(cfg.domain_rand, self.physics, self.dt, steps, self.numbers, kernels)
-        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers)
+        walk = cfg.domain_rand.held_goals
+        goals = HeldGoals(walk, robot, cfg.control, n, self.dt, device, cfg.origins.where) if walk.step else None
+        self.disturbances = Disturbances(
+            cfg.domain_rand, self.physics, self.dt, steps, self.numbers, kernels, robot.joint_names, goals
+        )
+        offsets = None if goals is None else goals.offsets
+        self.control = Control(robot, cfg.control, self.physics.ctrl, cfg.sim.dt, kernels, self.numbers, offsets)
         self.torques, self.default_dof_pos = self.control.torques, self.control.default_dof_pos
         self.make_commands()
         self.contacts = FeetContacts(n, len(robot.feet_indices), self.dt, device, kernels, contact_force(robot.mass))
@@ -141,7 +147,15 @@ class RobotTask(RobotTerms, BaseTask):
         self._vary()
         self.dof_pos_limits = self._soft_limits(robot)
         self._without_wheels = torch.tensor(robot.without_wheels, device=device) if robot.wheels.any() else None
+        seen = observed_joints(robot, cfg.observations.joints, cfg.origins.where)
+        self.seen_joints = {"dof_pos": tuple(i for i in seen if not robot.wheels[i]), "dof_vel": seen}
+        """Observation term -> indices of the joints that it shows."""
+        self._seen_angles, self._seen_speeds = (
+            None if len(each) == robot.num_dof else torch.tensor(each, device=device) for each in self.seen_joints.values()
+        )
         self.posture_joints = torch.tensor(~robot.swings & ~robot.wheels, dtype=torch.float32, device=device)
+        if goals is not None:
+            self.posture_joints[list(self.control.held)] = 0.0
         self.measured_heights = self.height_scan.heights
         self.terrain_curriculum: TerrainCurriculum | None = None
         """Tiles on which episodes begin; None on a plane. Robots keep their tiles unless a subclass moves them."""
@@ -212,7 +226,9 @@ class RobotTask(RobotTerms, BaseTask):
         if self.robot.mirror is None:
             return None
         groups, points = self.observation_groups, self.height_scan.points
-        return MirrorImages(type(self).__name__, self.MIRRORED, groups, self.robot, self.control.acted, points)
+        seen, control = self.seen_joints, self.control
+        joints = {"actions": control.acted, "angles": seen["dof_pos"], "speeds": seen["dof_vel"], "held": control.held}
+        return MirrorImages(type(self).__name__, self.MIRRORED, groups, self.robot, joints, points)
 
     # ---- hooks of a control step -------------------------------------------------------------------------------------
 

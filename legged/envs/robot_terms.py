@@ -3,6 +3,8 @@
 Formulas and names are those of legged_gym (Rudin et al., arXiv 2109.11978). If a term differs, its docstring says so.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -40,8 +42,9 @@ class RobotTerms:
         "base_ang_vel": "rotation",
         "projected_gravity": "vector",
         "dof_pos": "angles",
-        "dof_vel": "joints",
+        "dof_vel": "speeds",
         "actions": "actions",
+        "held_targets": "held",
         "heights": "heights",
         "passive_pos": "passive",
         "passive_vel": "passive",
@@ -102,6 +105,9 @@ class RobotTerms:
     """(D,) 1 for joints that neither swing a leg forward and back nor turn a wheel, 0 for the others."""
     _without_wheels: Tensor | None
     """Indices of the joints that are not wheels; None if the robot has no wheels."""
+    _seen_angles: Tensor | None
+    """Indices of the joints that `dof_pos` observes; None for all joints. `_seen_speeds`: the same for `dof_vel`."""
+    _seen_speeds: Tensor | None
     contacts: FeetContacts
     """Contact and swing times of the feet."""
     control: Control
@@ -138,12 +144,18 @@ class RobotTerms:
     @unit("rad")
     def _obs_dof_pos(self) -> Tensor:
         """Joint angle minus default_joint_angles, by joint, without wheels [rad]."""
-        return self.without_wheels(self.dof_pos - self.control.zero_dof_pos)
+        angles = self.dof_pos - self.control.zero_dof_pos
+        return angles if self._seen_angles is None else angles.index_select(1, self._seen_angles)
 
     @unit("rad/s")
     def _obs_dof_vel(self) -> Tensor:
         """Joint velocity, by joint [rad/s]."""
-        return self.dof_vel
+        return self.dof_vel if self._seen_speeds is None else self.dof_vel.index_select(1, self._seen_speeds)
+
+    @unit("rad")
+    def _obs_held_targets(self) -> Tensor:
+        """Target angle minus default_joint_angles in the next control step, by joint of control.held [rad]."""
+        return self.control.held_offsets
 
     @unit("rad")
     def _obs_passive_pos(self) -> Tensor:
@@ -322,8 +334,9 @@ class RobotTerms:
     @concurrent
     @unit("rad^2")
     def _reward_posture(self) -> Tensor:
-        """Sum of squared distances from the default angles, for all joints except wheels and joints that swing a leg forward
-        and back. The waist, the arms, and the abduction and yaw of the hips are counted [rad^2].
+        """Sum of squared distances from the default angles, for all joints except wheels, joints that swing a leg forward
+        and back, and held joints whose goals move. The waist, arms that do not move, and the abduction and yaw of the hips
+        are counted [rad^2].
         """
         return ((self.dof_pos - self.default_dof_pos) * self.posture_joints).square().sum(dim=1)
 
@@ -357,3 +370,15 @@ class RobotTerms:
         assert self.terrain is not None
         x, y = self.terrain.reach
         return (self.base_pos[:, 0].abs() > x) | (self.base_pos[:, 1].abs() > y)
+
+
+def observed_joints(robot: Robot, patterns: tuple[str, ...], where: Callable[[str], str] = str) -> tuple[int, ...]:
+    """Return the indices of the joints that `dof_vel` observes, and `dof_pos` too if they are no wheels. `where` turns a
+    dotted path into the beginning of an error message.
+
+    Raises:
+        ConfigError: a pattern matches no joint.
+    """
+    if not patterns:
+        return tuple(range(robot.num_dof))
+    return match_names(patterns, robot.joint_names, where("observations.joints"))

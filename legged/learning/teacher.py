@@ -111,6 +111,8 @@ def differences(here: TaskConfig, there: TaskConfig, terms: Iterable[str]) -> li
             pairs[f"domain_rand.observed_ranges.{drawn}"] = (_observed_as(here, drawn), _observed_as(there, drawn))
     if "push_force" in terms:
         pairs["domain_rand.forces"] = (_largest_forces(here), _largest_forces(there))
+    if {"dof_pos", "dof_vel"} & {*terms}:
+        pairs["observations.joints"] = tuple(getattr(cfg.observations, "joints", ()) for cfg in (here, there))  # type: ignore[assignment]
     if "heights" in terms and has_robot(here) and has_robot(there):
         for name in ("measured_points_x", "measured_points_y", "scan"):
             pairs[f"terrain.{name}"] = (getattr(here.terrain, name), getattr(there.terrain, name))

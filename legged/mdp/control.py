@@ -28,7 +28,8 @@ class Control:
     V: stiffness * (action_scale * action - dq) - damping * ddq, with the mean acceleration ddq of the last physics step
     T: action_scale * action
 
-    Each joint has one of these laws. Of the D joints, A have an action. The others are held: the law takes 0 as their action.
+    Each joint has one of these laws. Of the D joints, A have an action. The other K joints are held: the law P holds them at
+    their default angles, or at targets that move.
     """
 
     STATE = ("_last_dof_vel",)
@@ -41,9 +42,11 @@ class Control:
         sim_dt: float,
         kernels: "TaskKernels | None" = None,
         numbers: RandomPool | None = None,
+        held_offsets: Tensor | None = None,
     ) -> None:
         """Build the control law. It writes to `torques` (N, D), a tensor of the physics, and uses the device of this tensor.
         Gains come from `cfg` if it names any, else from the robot. Delays of targets are drawn from the pool `numbers`.
+        `held_offsets` (N, K) are the targets of held joints minus their default angles [rad], which their owner moves.
 
         Raises:
             ConfigError: a pattern matches no joint, a joint has no law, gain or scale, or joints are held by another law
@@ -81,6 +84,13 @@ class Control:
         self._varied = False
         self._target = torch.zeros_like(self.torques)  # joint angles (P), velocities (V) or torques (T)
         self._columns = None if len(self.acted) == robot.num_dof else torch.tensor(self.acted, device=torques.device)
+        self.held = tuple(i for i in range(robot.num_dof) if i not in self.acted)
+        """(K,) index of each held joint."""
+        self.held_offsets = torch.zeros(len(torques), len(self.held), device=torques.device)
+        """(N, K) targets of held joints minus their default angles [rad]."""
+        self._held_columns: Tensor | None = None
+        if held_offsets is not None:
+            self.held_offsets, self._held_columns = held_offsets, torch.tensor(self.held, device=torques.device)
         self._last_dof_vel = torch.zeros_like(self.torques)
         self.actuator: Actuator | None = None
         """Model of motors that are not ideal; None for ideal motors."""
@@ -144,9 +154,13 @@ class Control:
         return self.zero_dof_pos if self.law == "P" else self._zero
 
     def spread(self, actions: Tensor) -> Tensor:
-        """Return actions (N, A) times their scales, by joint (N, D). Held joints have 0."""
+        """Return actions (N, A) times their scales, by joint (N, D). Held joints have `held_offsets`."""
         scaled = actions * self.action_scale
-        return scaled if self._columns is None else torch.zeros_like(self.torques).index_copy_(1, self._columns, scaled)
+        if self._columns is None:
+            return scaled
+        spread = torch.zeros_like(self.torques).index_copy_(1, self._columns, scaled)
+        held = self._held_columns
+        return spread if held is None else spread.index_copy_(1, held, self.held_offsets)
 
     def compute(self, dof_pos: Tensor, dof_vel: Tensor) -> Tensor:
         """Compute torques (N, D) [N m] at joint angles [rad] and velocities [rad/s], each (N, D), for one physics step."""

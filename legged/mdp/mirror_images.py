@@ -18,7 +18,9 @@ MirrorKind = Literal[
     "command",
     "joints",
     "angles",
+    "speeds",
     "actions",
+    "held",
     "passive",
     "feet",
     "heights",
@@ -28,11 +30,12 @@ MirrorKind = Literal[
     "of_joints",
 ]
 """Kind of an observation, which determines its mirror image. `vector`: (x, y, z) of a velocity or direction; `rotation`: (x,
-y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`: one number for each joint; `angles`: one for each joint
-that is not a wheel; `actions`: one for each action; `passive`: one for each passive joint; `feet`: one for each foot;
-`heights`: the height scan; `same`: numbers that mirroring does not change; `scalar`: one number that mirroring does not
-change; `sideways`: one number that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: one
-number for each joint, which mirroring moves to the other side but does not negate, or one number for all joints."""
+y, z) of an angular velocity; `command`: (vx, vy, yaw rate); `joints`: one number for each joint; `angles`: one for each
+joint of observations.joints that is not a wheel; `speeds`: one for each joint of observations.joints; `actions`: one for each
+action; `held`: one for each held joint; `passive`: one for each passive joint; `feet`: one for each foot; `heights`: the
+height scan; `same`: numbers that mirroring does not change; `scalar`: one number that mirroring does not change; `sideways`:
+one number that is positive to the left; `vectors`: several vectors, (x, y, z) each; `of_joints`: one number for each joint,
+which mirroring moves to the other side but does not negate, or one number for all joints."""
 SIGNS = {"vector": (1.0, -1.0, 1.0), "rotation": (-1.0, 1.0, -1.0), "command": (1.0, -1.0, -1.0)}
 """Kind of term -> signs of its three numbers. A rotation is a pseudo-vector, so its y component keeps its sign."""
 
@@ -49,24 +52,25 @@ class MirrorImages:
         kinds: Mapping[str, str],
         groups: Mapping[str, ObservationGroup],
         robot: Robot,
-        acted: Sequence[int],
+        joints: Mapping[str, Sequence[int]],
         points: Tensor,
     ) -> None:
         """Compute the image of every observation group. Actions are mirrored like the term `actions`.
 
         `kinds` has the `MirrorKind` of each term. `owner` is the name of the task's class, for errors. `robot` is symmetric.
-        `acted` (A,) is the joint of each action. `points` (P, 2) are the points of the height scan in the yaw frame [m].
+        `joints` has the joints of the kinds `actions`, `angles`, `speeds` and `held`. `points` (P, 2) are the points of the
+        height scan in the yaw frame [m].
 
         Raises:
             ConfigError: a term has no kind, has an unknown kind, or has a width that does not fit its kind.
         """
         assert robot.mirror is not None
         self._owner, self._kinds, self._mirror, self._points = owner, kinds, robot.mirror, points.cpu()
-        self._joints = {"actions": acted, "angles": robot.without_wheels}
+        self._joints = joints
         device = next(iter(groups.values())).buffer.device
         self.groups = {name: self._group(group) for name, group in groups.items()}
         """Group -> its image, for all steps of its history."""
-        columns, signs = self._term("actions", len(acted))
+        columns, signs = self._term("actions", len(joints["actions"]))
         self.actions: Image = (columns.to(device), signs.to(device))
         """Image of the actions."""
 
@@ -109,9 +113,8 @@ class MirrorImages:
         if kind in self._joints:
             image = mirror_of_actions(self._mirror, self._joints[kind])
             if image is None:
-                raise ConfigError(
-                    f"{self._owner}: control.held: joints are held on one side only, so actions have no mirror image"
-                )
+                setting = "control.held" if kind in ("actions", "held") else "observations.joints"
+                raise ConfigError(f"{self._owner}: {setting} names joints on one side only, so {kind} have no mirror image")
             return torch.tensor(image[0]), torch.tensor(image[1])
         if kind == "sideways":
             return torch.zeros(1, dtype=torch.long), torch.tensor([-1.0])

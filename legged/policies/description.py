@@ -198,8 +198,12 @@ def describe_term(task: BaseTask, term: ObservationTerm, group: dict[str, Any], 
         entry |= {"points": points, "offset": legged.heights_offset, "limit": legged.heights_limit}
         entry["deepest"] = legged.deepest
         entry["scan"] = task.cfg.terrain.scan
-    if is_robot_task(task) and term.name == "dof_pos" and task.robot.wheels.any():
-        entry["joints"] = [task.robot.joint_names[i] for i in task.robot.without_wheels]
+    if is_robot_task(task) and term.name in ("dof_pos", "dof_vel"):
+        seen = task.seen_joints[term.name]
+        if len(seen) < task.robot.num_dof:
+            entry["joints"] = [task.robot.joint_names[i] for i in seen]
+    if is_robot_task(task) and term.name == "held_targets":
+        entry["joints"] = [task.robot.joint_names[i] for i in task.control.held]
     if is_robot_task(task) and term.name in ("passive_pos", "passive_vel") and task.robot.passive is not None:
         entry |= {"joints": list(task.robot.passive.names), "default": task.passive_default_pos.tolist()}
     return entry

@@ -132,6 +132,11 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
         ({"name": "my_gyro"}, "'my_gyro' cannot be made from 'gyro'"),
         ({"needs": "quaternion"}, "'base_ang_vel' cannot be made from 'quaternion'"),
         ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, but a robot gives 3"),
+        ({"name": "dof_pos", "needs": "joint positions", "joints": ["arm"] * 3}, r"is no policy\.json .* 'arm' is not in list"),
+        (
+            {"name": "dof_pos", "needs": "joint positions", "joints": ["LF_HAA"]},
+            "'dof_pos' has 3 numbers, but a robot gives 1",
+        ),
         ({"start": 3}, "'base_ang_vel' must start at column 0, got 3"),
     ],
 )
@@ -313,8 +318,9 @@ def reading_of(task, robot, sources):
         ("anymal_c_proprio", SMALL_TERRAIN),
         ("anymal_c_flat", [("train.policy.rnn_type", "lstm"), ("train.policy.rnn_num_layers", 2)]),
         ("anymal_c_flat", [("train.policy.rnn_type", "gru"), ("control.held", ["HAA"])]),
+        ("anymal_c_proprio", [*SMALL_TERRAIN, ("control.held", ["HAA"]), ("observations.joints", ["KFE", "HFE"])]),
     ],
-    ids=["height map", "shallow height map", "history", "LSTM", "GRU, held joints"],
+    ids=["height map", "shallow height map", "history", "LSTM", "GRU, held joints", "some joints"],
 )
 def test_the_program_sees_and_does_what_the_tasks_policy_does(name, changes, tmp_path):
     """Observations to 2e-5 in their scaled units, and actions to 1e-5, over an episode's first steps."""
