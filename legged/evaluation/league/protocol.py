@@ -40,6 +40,16 @@ WANDER, WANDER_STEPS = 0.06, 25
 """A goal is WANDER_STEPS uniform steps of at most WANDER [rad] away from the last one."""
 TRIES = 8
 """Number of goals that are tried until the hands are in front of the body. After that the arms stay."""
+ARM_LINKS = (  # of `g1_29dof.xml` in unitree_mujoco; this package's G1 has the same arm to within 3e-4 rad
+    ((0.0039563, 0.10022, 0.23778), (0.990264, 0.139201, 1.38722e-05, -9.86868e-05), (0.0, 1.0, 0.0)),
+    ((0.0, 0.038, -0.013831), (0.990268, -0.139172, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.0, 0.00624, -0.1032), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.015783, 0.0, -0.080518), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.1, 0.00188791, -0.01), (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.038, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.046, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+)
+"""Links of the league's left arm: position in the frame of the link before [m], orientation (w, x, y, z), axis of the joint."""
 HAND = np.array([(x, y, z) for x in (0.0, 0.13182935) for y in (-0.04790606, 0.01865148) for z in (-0.0430289, 0.0634499)])
 """Corners of the left rubber hand's box, where the league puts it in the frame of the last link [m]."""
 HEAD = 0.32479587 - 0.054
@@ -82,44 +92,30 @@ def punches(run: int, joints: int) -> Punches:
     return Punches(*(np.array(values) for values in zip(*found, strict=True)))
 
 
-class Hands:
-    """The check that both hands are in front of the body and below the head."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
-        """Read the left arm of a league's robot. The right arm is its mirror image, so one arm is enough."""
-        joints = [model.joint(f"left_{name}").id for name in ARM_JOINTS]
-        links = model.jnt_bodyid[joints]
-        self._axes = torch.from_numpy(model.jnt_axis[joints])
-        self._arms, self._turns = torch.from_numpy(model.body_pos[links]), torch.from_numpy(model.body_quat[links])
-        self._back = self.reach(STANCE[None])[0][0]
-
-    def reach(self, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far back and how far up the left hand reaches at arm angles (K, 7) [rad], (K,) each: smallest x and
-        largest z in the frame of the torso [m].
-        """
-        given = torch.from_numpy(angles)
-        place, turn = torch.zeros(len(given), 3, dtype=torch.float64), torch.zeros(len(given), 4, dtype=torch.float64)
-        turn[:, 0] = 1.0
-        for angle, axis, arm, own in zip(given.T, self._axes, self._arms, self._turns, strict=True):
-            place = place + quat_rotate(turn, arm.expand_as(place))
-            turn = quat_multiply(quat_multiply(turn, own.expand_as(turn)), quat_from_angle_axis(angle, axis))
-        corners = torch.from_numpy(HAND).expand(len(given), -1, -1)
-        reached = place.unsqueeze(1) + quat_rotate(turn.unsqueeze(1).expand(-1, len(HAND), -1), corners)
-        return reached[..., 0].amin(dim=1).numpy(), reached[..., 2].amax(dim=1).numpy()
-
-    def allow(self, angles: np.ndarray) -> np.ndarray:
-        """Return whether arm angles (K, 7) [rad] keep the hands no further back than at the start and below the head, (K,)."""
-        back, up = self.reach(angles)
-        return (back >= self._back) & (up <= HEAD)  # type: ignore[no-any-return]
-
-
-def arm_goals(runs: Sequence[int], model: mujoco.MjModel, seconds: float = RUN_S) -> np.ndarray:
-    """Return the angles of the left arm at the start and at the end of each GOAL_S, (N, 1 + goals, 7) [rad], for the N runs
-    with the ids `runs`. Between the ends, the angles change linearly.
+def reach(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far back and how far up the left hand reaches at arm angles (K, 7) [rad], (K,) each: smallest x and largest
+    z of its box in the frame of the torso [m]. The right arm is the mirror image, so its hand reaches as far.
     """
-    low, high = model.jnt_range[[model.joint(f"left_{name}").id for name in ARM_JOINTS]].T
-    hands, streams = Hands(model), [Stream(run, ARMS) for run in runs]
-    goals = np.tile(STANCE, (len(runs), 1 + round(seconds / GOAL_S), 1))
+    given = torch.from_numpy(angles)
+    place, turn = torch.zeros(len(given), 3, dtype=torch.float64), torch.zeros(len(given), 4, dtype=torch.float64)
+    turn[:, 0] = 1.0
+    for angle, link in zip(given.T, ARM_LINKS, strict=True):
+        arm, own, axis = (torch.tensor(numbers, dtype=torch.float64) for numbers in link)
+        place = place + quat_rotate(turn, arm.expand_as(place))
+        turn = quat_multiply(quat_multiply(turn, own.expand_as(turn)), quat_from_angle_axis(angle, axis))
+    corners = torch.from_numpy(HAND).expand(len(given), -1, -1)
+    reached = place.unsqueeze(1) + quat_rotate(turn.unsqueeze(1).expand(-1, len(HAND), -1), corners)
+    return reached[..., 0].amin(dim=1).numpy(), reached[..., 2].amax(dim=1).numpy()
+
+
+def arm_goals(runs: Sequence[int], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the angles of the left arm at the start and at the end of each GOAL_S, (N, 1 + goals, 7) [rad], for the N runs
+    with the ids `runs`. Between the ends, the angles change linearly. `low` and `high` (7,) are the limits of the joints.
+
+    At every goal both hands are no further back than at the start, and below the head.
+    """
+    streams, (furthest_back, _) = [Stream(run, ARMS) for run in runs], reach(STANCE[None])
+    goals = np.tile(STANCE, (len(runs), 1 + round(RUN_S / GOAL_S), 1))
     for k in range(1, goals.shape[1]):
         goals[:, k] = goals[:, k - 1]
         waiting = np.arange(len(runs))
@@ -128,7 +124,8 @@ def arm_goals(runs: Sequence[int], model: mujoco.MjModel, seconds: float = RUN_S
             tried = goals[waiting, k - 1]
             for step in np.moveaxis(np.array(steps), 1, 0):
                 tried = np.clip(tried + WANDER * (2.0 * step - 1.0), low, high)
-            allowed = hands.allow(tried)
+            back, up = reach(tried)
+            allowed = (back >= furthest_back) & (up <= HEAD)
             goals[waiting[allowed], k] = tried[allowed]
             waiting = waiting[~allowed]
             if not len(waiting):
