@@ -49,7 +49,8 @@ ARM_LINKS = (  # of `g1_29dof.xml` in unitree_mujoco; this package's G1 has the 
     ((0.038, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((0.046, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
 )
-"""Links of the league's left arm: position in the frame of the link before [m], orientation (w, x, y, z), axis of the joint."""
+"""Links of the league's left arm: position [m] and orientation (w, x, y, z) in the frame of the link before, and the joint's
+axis."""
 HAND = np.array([(x, y, z) for x in (0.0, 0.13182935) for y in (-0.04790606, 0.01865148) for z in (-0.0430289, 0.0634499)])
 """Corners of the left rubber hand's box, where the league puts it in the frame of the last link [m]."""
 HEAD = 0.32479587 - 0.054

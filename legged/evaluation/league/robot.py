@@ -1,6 +1,5 @@
 """The league's robot: this package's G1 with the masses, motors and feet of the league's model."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 
