@@ -3,6 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged.config import LeggedConfig, follows_velocities
+from legged.config.actuator import ActuatorConfig
 from legged.errors import ConfigError
 from legged.evaluation.intervals import bootstrap_mean, wilson
-from legged.evaluation.league.protocol import CONTROL_DT, POINTS, RUN_S
+from legged.evaluation.league.protocol import ARM_JOINTS, CONTROL_DT, POINTS, RUN_S
 from legged.evaluation.league.robot import OURS, servo_gains, write_robot
 from legged.evaluation.league.task import SLOT, STAGES, Course, LeagueTask, make_league
 from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
@@ -34,6 +36,8 @@ MOST_RUNS = 2**16
 """Largest number of runs of a stage."""
 TASK = "g1_flat"
 """Task in which ONNX policies run. Only its robot matters for them."""
+SOLVER = {"dt": 0.002, "impratio": 1.0, "iterations": 100, "ls_iterations": 50, "nconmax": 64, "njmax": 320}
+"""Settings of the section `sim`: MuJoCo's defaults, and memory for a robot that lies on the ground."""
 AT_ONCE_S = 1.0
 """Simulated time after which the runs are asked whether all have ended [s]."""
 Act = Callable[[LeagueTask, TensorDict], Tensor]
@@ -42,29 +46,28 @@ Act = Callable[[LeagueTask, TensorDict], Tensor]
 
 def rules(cfg: LeggedConfig, runs: int, robot: Robot, gains: tuple[np.ndarray, np.ndarray]) -> list[tuple[str, Any]]:
     """Return the overrides that make a task run under the league's rules, on its robot with the gains (D,) each."""
-    steps = round(CONTROL_DT / 0.002)
     tables = (dict(zip(robot.joint_names, values.tolist(), strict=True)) for values in gains)
     return [
         *undisturbed(cfg, runs, RUN_S),
         ("robot", str(robot.folder)),
         ("terrain.mesh_type", "plane"),
-        ("control.actuator", {}),
         *zip(("control.stiffness", "control.damping"), tables, strict=True),
-        ("control.decimation", steps),
-        *(("sim.dt", 0.002), ("sim.impratio", 1.0), ("sim.iterations", 100), ("sim.ls_iterations", 50)),
-        *(("sim.self_collisions", True), ("sim.nconmax", 64), ("sim.njmax", 320)),
+        *((f"sim.{name}", value) for name, value in SOLVER.items()),
+        ("sim.self_collisions", True),
+        ("control.decimation", round(CONTROL_DT / SOLVER["dt"])),
         ("rewards.scales", dict.fromkeys(cfg.rewards.scales, 0.0)),
     ]
 
 
-def with_league_arms(gains: tuple[np.ndarray, np.ndarray], robot: Robot, stage: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a policy's gains (D,) each, but in all stages except `own` the league's gains for the arms."""
-    arms = np.array([name.startswith(("left_", "right_")) for name in robot.joint_names]) & ~np.array(
-        [any(part in name for part in ("hip", "knee", "ankle")) for name in robot.joint_names]
-    )
-    stiffness, damping = (
-        np.where(arms & (stage != "own"), league, own) for league, own in zip(servo_gains(robot), gains, strict=True)
-    )
+def with_ideal_motors(cfg: LeggedConfig) -> LeggedConfig:
+    """Return a configuration with motors that give the torques of the PD law, up to their limits."""
+    return replace(cfg, control=replace(cfg.control, actuator=ActuatorConfig()))
+
+
+def gains_of(stage: str, robot: Robot, own: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gains (D,) of a stage: the policy's, `own`. In all stages except `own`, the arms have the league's gains."""
+    arms = np.array([name.endswith(ARM_JOINTS) for name in robot.joint_names]) & (stage != "own")
+    stiffness, damping = (np.where(arms, league, given) for league, given in zip(servo_gains(robot), own, strict=True))
     return stiffness, damping
 
 
@@ -121,14 +124,15 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
     own = load_robot(cfg.robot)
     if own.folder != load_robot(OURS).folder:
         raise ConfigError(f"POLICY: the league's robot is '{OURS}', but '{setting.policy.cfg.task}' has '{own.name}'")
-    ranges = cfg.commands.ranges
+    assert follows_velocities(setting.policy.cfg)
+    policy, ranges = replace(setting.policy, cfg=with_ideal_motors(setting.policy.cfg)), cfg.commands.ranges
     limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
 
     def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
-        gains = with_league_arms(control_gains(own, cfg.control), robot, stage)
+        gains = gains_of(stage, robot, control_gains(own, cfg.control))
         changes = [*rules(cfg, len(runs), robot, gains), *setting.asked]
         make = partial(make_league, Course.of(stage, runs, robot, limits))
-        task, actor = restore(setting.policy, changes, setting.device, setting.graph, None, make)
+        task, actor = restore(policy, changes, setting.device, setting.graph, None, make)
         return task, lambda _, observations: actor(observations)
 
     found = measure_stages(build, stages)
@@ -162,7 +166,7 @@ def evaluate_foreign(
 
     def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
         foreign = ForeignPolicy(file, layout, robot)
-        gains = with_league_arms((foreign.stiffness, foreign.damping), robot, stage)
+        gains = gains_of(stage, robot, (foreign.stiffness, foreign.damping))
         targets = [("control.action_scale", 1.0), ("control.clip_actions", 1000.0)]
         changes = nominal(cfg, [*rules(cfg, len(runs), robot, gains), *targets])
         foreign.reset(len(runs))

@@ -39,8 +39,7 @@ class Stream:
     def __init__(self, run: int, number: int) -> None:
         """Begin stream `number` of the run with the id `run`."""
         self._twister = np.random.MT19937()
-        words = {"key": spread((run, number)), "pos": WORDS}
-        self._twister.state = {"bit_generator": "MT19937", "state": words}
+        self._twister.state = {"bit_generator": "MT19937", "state": {"key": spread((run, number)), "pos": WORDS}}
 
     def units(self, count: int) -> np.ndarray:
         """Return the next `count` numbers, uniform in [0, 1), (count,): the upper 24 bits of each 32-bit word."""

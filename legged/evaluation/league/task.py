@@ -125,7 +125,7 @@ class LeagueTask(LeggedRobot):
         frame = np.where(np.array([each.of_child for each in course.punches]), child, model.body_parentid[child])
         self._pushed, self._frame = tensor(child, torch.long), tensor(frame, torch.long)
         lean, force = (tensor(values) for values in (protocol.league_frames(model), [each.force for each in course.punches]))
-        self._force = quat_rotate(lean[self._frame], force)
+        self._blows = quat_rotate(lean[self._frame], force)
         self._centre = tensor(model.body_ipos)
         self._start_qpos, self._start_qvel = (tensor(values) for values in hang(model, self.robot))
         self._reached = torch.zeros(n, 2, dtype=torch.bool, device=torch.device(self.device))
@@ -166,7 +166,7 @@ class LeagueTask(LeggedRobot):
         slot, step = self._slot(), self.episode_length_buf % SLOT
         link, frame = self._pushed[self._rows, slot], self._frame[self._rows, slot]
         active = ((step >= PUNCH[0]) & (step < PUNCH[1])).unsqueeze(1)
-        force = active * quat_rotate(self.links.quat[self._rows, frame - 1], self._force[self._rows, slot])
+        force = active * quat_rotate(self.links.quat[self._rows, frame - 1], self._blows[self._rows, slot])
         arm = quat_rotate(self.links.quat[self._rows, link - 1], self._centre[link])
         forces.zero_()
         forces[self._rows, link] = torch.cat([force, torch.linalg.cross(-arm, force)], dim=1)
