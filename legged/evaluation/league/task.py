@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict
@@ -13,7 +12,6 @@ from torch import Tensor
 from legged.envs import LeggedRobot
 from legged.evaluation.league import protocol
 from legged.evaluation.league.protocol import CONTROL_DT, GOAL_S, POINT_S, POINTS
-from legged.evaluation.league.robot import servo_gains
 from legged.math import quat_rotate, wrap_to_pi, yaw_of
 from legged.mdp.sensors import BodyStates, Sensor
 from legged.registry import task_class
@@ -28,8 +26,8 @@ STAGES = {
 """Stage of the ladder -> what happens in it."""
 FALLEN = 0.2
 """Height of the pelvis below which a run ends [m]."""
-CRANE_S, CRANE_HEIGHT = 3.0, 0.793
-"""Time for which a crane holds the pelvis before a run [s], and the pelvis' height meanwhile [m]."""
+CRANE_HEIGHT = 0.793
+"""Height of the pelvis at which a crane lets go of the robot [m]. The joints are then at rest at the default angles."""
 GAIN = 1.5
 """Command per distance to the waypoint and per error of the yaw [1/s]."""
 REACHED, LEFT = (0.10, 0.05), (0.20, 0.12)
@@ -65,22 +63,6 @@ class Course:
         else:
             goals = np.tile(protocol.STANCE, (len(runs), 1 + POINTS * SLOT // GOAL, 1))
         return cls(stage, points, goals, [protocol.punches(run, robot.num_dof) for run in runs], limits)
-
-
-def hang(model: mujoco.MjModel, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
-    """Return the generalised positions and velocities with which every run begins: after CRANE_S in which a crane holds the
-    pelvis and the league's own servos hold the joints at the default angles.
-    """
-    data, (stiffness, damping) = mujoco.MjData(model), servo_gains(robot)
-    angles, rates = list(robot.qpos_columns), list(robot.qvel_columns)
-    data.qpos[:] = robot.default_qpos
-    for _ in range(round(CRANE_S / model.opt.timestep)):
-        data.qpos[:7], data.qvel[:6] = (0.0, 0.0, CRANE_HEIGHT, 1.0, 0.0, 0.0, 0.0), 0.0
-        torques = stiffness * (robot.default_dof_pos - data.qpos[angles]) - damping * data.qvel[rates]
-        data.ctrl[:] = np.clip(torques, -robot.torque_limits, robot.torque_limits)
-        mujoco.mj_step(model, data)
-    data.qpos[:7], data.qvel[:6] = (0.0, 0.0, CRANE_HEIGHT, 1.0, 0.0, 0.0, 0.0), 0.0
-    return data.qpos.copy(), data.qvel.copy()
 
 
 def make_league(course: Course, cfg: Any, device: torch.device, graph: bool, terrain: None) -> "LeagueTask":
@@ -127,7 +109,6 @@ class LeagueTask(LeggedRobot):
         lean, force = (tensor(values) for values in (protocol.league_frames(model), [each.force for each in course.punches]))
         self._blows = quat_rotate(lean[self._frame], force)
         self._centre = tensor(model.body_ipos)
-        self._start_qpos, self._start_qvel = (tensor(values) for values in hang(model, self.robot))
         self._reached = torch.zeros(n, 2, dtype=torch.bool, device=torch.device(self.device))
         self.alive = torch.ones(n, dtype=torch.bool, device=torch.device(self.device))
         """(N,) True until the run ends by a fall."""
@@ -145,8 +126,12 @@ class LeagueTask(LeggedRobot):
         return super().reset()
 
     def place(self) -> None:
-        self.reset_qpos.copy_(self._start_qpos.expand_as(self.reset_qpos))
-        self.reset_qvel.copy_(self._start_qvel.expand_as(self.reset_qvel))
+        self.reset_qpos[:, :2].zero_()
+        self.reset_qpos[:, 2].fill_(CRANE_HEIGHT)
+        self.reset_qpos[:, 3].fill_(1.0)
+        self.reset_qpos[:, 4:7].zero_()
+        self.reset_qpos[:, 7:].copy_(self.default_dof_pos.expand(self.num_envs, -1))
+        self.reset_qvel.zero_()
 
     def set_controls(self) -> None:
         super().set_controls()
