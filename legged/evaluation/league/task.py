@@ -109,6 +109,7 @@ class LeagueTask(LeggedRobot):
         lean, force = (tensor(values) for values in (protocol.league_frames(model), [each.force for each in course.punches]))
         self._blows = quat_rotate(lean[self._frame], force)
         self._centre = tensor(model.body_ipos)
+        self._near, self._far = tensor(REACHED), tensor(LEFT)
         self._reached = torch.zeros(n, 2, dtype=torch.bool, device=torch.device(self.device))
         self.alive = torch.ones(n, dtype=torch.bool, device=torch.device(self.device))
         """(N,) True until the run ends by a fall."""
@@ -173,9 +174,8 @@ class LeagueTask(LeggedRobot):
         point, yaw = self._points[self._rows, slot], yaw_of(self.base_quat)
         way, turn = point[:, :2] - self.base_pos[:, :2], wrap_to_pi(point[:, 2] - yaw)
         missed = torch.stack([way.norm(dim=1), turn.abs()], dim=1)
-        here = missed.new_tensor(REACHED), missed.new_tensor(LEFT)
         kept = self._reached & (step > 0).unsqueeze(1)
-        self._reached.copy_(torch.where(kept, missed <= here[1], missed < here[0]))
+        self._reached.copy_(torch.where(kept, missed <= self._far, missed < self._near))
         walks = self.alive & (self.episode_length_buf < POINTS * SLOT)
         self.missed[self._rows, slot] = torch.where(walks.unsqueeze(1), missed, self.missed[self._rows, slot])
         ahead, aside = torch.cos(yaw), torch.sin(yaw)
