@@ -4,16 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from legged.envs import LeggedRobot
 from legged.evaluation.league import protocol
 from legged.evaluation.league.protocol import CONTROL_DT, GOAL_S, POINT_S, POINTS
-from legged.math import quat_rotate, wrap_to_pi, yaw_of
-from legged.mdp.sensors import BodyStates, Sensor
+from legged.math import quat_multiply, quat_rotate, wrap_to_pi, yaw_of
 from legged.registry import task_class
 from legged.robots.robot import Robot
 
@@ -65,6 +66,20 @@ class Course:
         return cls(stage, points, goals, [protocol.punches(run, robot.num_dof) for run in runs], limits)
 
 
+def chains_of(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Return the joints on the way from the base to each of D joints, that joint included, (D, L). The joints turn `bodies`
+    (D,). Shorter chains begin with -1.
+    """
+    numbers, chains = {int(body): joint for joint, body in enumerate(bodies)}, []
+    for body in bodies:
+        chain: list[int] = []
+        while body in numbers:
+            chain, body = [numbers[int(body)], *chain], model.body_parentid[body]
+        chains.append(chain)
+    longest = max(map(len, chains))
+    return np.array([[-1] * (longest - len(chain)) + chain for chain in chains])
+
+
 def make_league(course: Course, cfg: Any, device: torch.device, graph: bool, terrain: None) -> "LeagueTask":
     """Build the task of `cfg` with a robot for each run of `course`."""
     kind: Any = task_class(cfg.task)
@@ -79,11 +94,6 @@ class LeagueTask(LeggedRobot):
 
     def pushed_by_forces(self) -> bool:
         return self.course.stage == "punches"
-
-    def make_sensors(self) -> dict[str, Sensor]:
-        names = [self.physics.model.body(i).name for i in range(1, self.physics.model.nbody)]
-        self.links = BodyStates(self.physics, names, self.kernels)
-        return {**super().make_sensors(), "links": self.links}
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
         """Return no terminations, because a fall is a score here and does not begin a new episode."""
@@ -103,12 +113,16 @@ class LeagueTask(LeggedRobot):
         self._points, self._limits = tensor(course.points), tensor(course.limits)
         self._rows = torch.arange(n, device=torch.device(self.device))
         bodies = model.jnt_bodyid[[model.joint(name).id for name in names]]
-        child = bodies[np.array([each.joint for each in course.punches])]
-        frame = np.where(np.array([each.of_child for each in course.punches]), child, model.body_parentid[child])
-        self._pushed, self._frame = tensor(child, torch.long), tensor(frame, torch.long)
+        joint = np.array([each.joint for each in course.punches])
+        of_child = np.array([each.of_child for each in course.punches])
+        frame = np.where(of_child, bodies[joint], model.body_parentid[bodies[joint]])
         lean, force = (tensor(values) for values in (protocol.league_frames(model), [each.force for each in course.punches]))
-        self._blows = quat_rotate(lean[self._frame], force)
-        self._centre = tensor(model.body_ipos)
+        self._blows = quat_rotate(lean[tensor(frame, torch.long)], force)
+        self._struck, self._of_child = tensor(joint, torch.long), tensor(of_child, torch.bool)
+        self._links, self._centres = tensor(bodies, torch.long), tensor(model.body_ipos[bodies])
+        chains = chains_of(model, bodies)
+        self._chains = tensor(np.maximum(chains, 0), torch.long)
+        self._axes = tensor(model.jnt_axis[model.body_jntadr[bodies]][chains] * (chains >= 0)[..., None])
         self._near, self._far = tensor(REACHED), tensor(LEFT)
         self._reached = torch.zeros(n, 2, dtype=torch.bool, device=torch.device(self.device))
         self.alive = torch.ones(n, dtype=torch.bool, device=torch.device(self.device))
@@ -142,20 +156,30 @@ class LeagueTask(LeggedRobot):
             goal, share = step // GOAL, ((step % GOAL + 1) / GOAL * (step > 0)).unsqueeze(1)
             last = self._goals[self._rows, goal]
             self.control.aim(self._arms, last + share * (self._goals[self._rows, goal + 1] - last))
+
+    def apply_control(self) -> None:
+        super().apply_control()
         if self.course.stage == "punches":
             self._punch()
 
     def _punch(self) -> None:
-        """Set the external forces of this control step."""
+        """Set the external forces of a physics step. The struck link turns, and so does the force."""
         forces = self.physics.forces
         assert forces is not None
         slot, step = self._slot(), self.episode_length_buf % SLOT
-        link, frame = self._pushed[self._rows, slot], self._frame[self._rows, slot]
+        struck = self._struck[self._rows, slot]
+        half = 0.5 * self.dof_pos.gather(1, self._chains[struck]).unsqueeze(2)
+        turns = torch.cat([torch.cos(half), torch.sin(half) * self._axes[struck]], dim=2)
+        parent = child = self.physics.qpos[:, 3:7]
+        for turn in turns.unbind(dim=1):
+            # A chain begins with fillers, whose axes are zero. They have to leave the orientation as it is.
+            parent, child = child, quat_multiply(child, normalize(turn, dim=1))
+        frame = torch.where(self._of_child[self._rows, slot].unsqueeze(1), child, parent)
         active = ((step >= PUNCH[0]) & (step < PUNCH[1])).unsqueeze(1)
-        force = active * quat_rotate(self.links.quat[self._rows, frame - 1], self._blows[self._rows, slot])
-        arm = quat_rotate(self.links.quat[self._rows, link - 1], self._centre[link])
+        force = active * quat_rotate(frame, self._blows[self._rows, slot])
+        arm = quat_rotate(child, self._centres[struck])
         forces.zero_()
-        forces[self._rows, link] = torch.cat([force, torch.linalg.cross(-arm, force)], dim=1)
+        forces[self._rows, self._links[struck]] = torch.cat([force, torch.linalg.cross(-arm, force)], dim=1)
 
     def _slot(self) -> Tensor:
         """Return the index of each robot's waypoint, (N,)."""

@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from legged.cli.main import main
 from legged.evaluation.league.measuring import gains_of, rules, run_tours, scores, with_ideal_motors
-from legged.evaluation.league.protocol import MIRROR, STANCE
+from legged.evaluation.league.protocol import MIRROR, STANCE, league_frames, punches
 from legged.evaluation.league.robot import servo_gains, write_robot
 from legged.evaluation.league.task import Course, LeagueTask, make_league
 from legged.policies.foreign import ForeignPolicy, Layout
@@ -117,29 +117,41 @@ def test_a_task_without_actions_for_the_arms_is_measured_too(robot):
     assert float(task.control._target[0, 15]) == pytest.approx(0.1525, abs=5e-5)
 
 
+def test_punches_last_four_control_steps(robot):
+    task = league_task(robot, "punches")
+    for step, pushed in ((4, False), (5, True), (8, True), (9, False), (254, False), (255, True)):
+        at(task, step)
+        task.apply_control()
+        assert (task.physics.forces.abs().sum(dim=(1, 2)) > 0.0).tolist() == [pushed] * 2
+    assert league_task(robot, "walking").physics.forces is None
+
+
 def test_a_punch_is_a_force_at_the_anchor_of_the_joint(robot):
     task = league_task(robot, "punches")
     model, data = task.physics.model, mujoco.MjData(task.physics.model)
-    for step in (4, 5, 8, 9):
-        at(task, step)
-        task.set_controls()
-        pushed = task.physics.forces.abs().sum(dim=(1, 2)) > 0.0
-        assert pushed.tolist() == [step in (5, 8)] * 2
-    for slot, joint, of_parent, force in (
-        (0, "right_shoulder_roll_joint", False, (48.04, -88.54, -128.50)),
-        (1, "left_elbow_joint", True, (-110.34, -26.25, -62.36)),
-    ):
+    rng = np.random.default_rng(0)
+    data.qpos[2:7] = 0.8, *(rng.normal(size=4))
+    data.qpos[7:] = rng.uniform(*model.jnt_range[1:].T)
+    mujoco.mj_normalizeQuat(model, data.qpos)
+    mujoco.mj_forward(model, data)
+    without, frames = data.qfrc_smooth.copy(), league_frames(model)
+    task.physics.qpos[:] = torch.from_numpy(data.qpos)
+    task.dof_pos[:] = torch.from_numpy(data.qpos[7:])
+    for slot in range(18):
         at(task, 250 * slot + 6)
-        task.set_controls()
-        data.qpos[:], data.xfrc_applied[:] = task.physics.qpos[0].numpy(), 0.0
-        mujoco.mj_forward(model, data)
-        link, before = int(model.joint(joint).bodyid[0]), data.qfrc_smooth.copy()
-        frame = model.body_parentid[link] if of_parent else link  # these frames do not lean in the league
-        world, wanted = data.xmat[frame].reshape(3, 3) @ force, np.zeros(model.nv)
-        mujoco.mj_applyFT(model, data, world, np.zeros(3), data.xanchor[model.joint(joint).id], link, wanted)
-        data.xfrc_applied[:] = task.physics.forces[0].numpy()
-        mujoco.mj_forward(model, data)
-        assert data.qfrc_smooth - before == pytest.approx(wanted, abs=0.01)
+        task.apply_control()
+        for run in range(2):
+            each = punches(run, 29)
+            joint = model.joint(robot.joint_names[each.joint[slot]])
+            link = int(joint.bodyid[0])
+            frame = link if each.of_child[slot] else int(model.body_parentid[link])
+            world, wanted = np.zeros(3), np.zeros(model.nv)
+            mujoco.mju_rotVecQuat(world, each.force[slot], frames[frame])
+            world = data.xmat[frame].reshape(3, 3) @ world
+            mujoco.mj_applyFT(model, data, world, np.zeros(3), data.xanchor[joint.id], link, wanted)
+            data.xfrc_applied[:] = task.physics.forces[run].numpy()
+            mujoco.mj_forward(model, data)
+            assert data.qfrc_smooth - without == pytest.approx(wanted, abs=1e-3)
 
 
 def test_a_run_ends_when_the_pelvis_is_low(robot):
