@@ -89,7 +89,7 @@ def check_points(given: int | None, full: bool) -> int:
     return given if given is not None else 256 if full else 32
 
 
-def _settle(args: argparse.Namespace, follows: bool = True) -> Setting:
+def settle(args: argparse.Namespace, follows: bool = True) -> Setting:
     """Return the setting of a measurement from its command line. If `follows`, the policy must follow velocity commands.
 
     Raises:
@@ -135,11 +135,11 @@ def evaluate(args: argparse.Namespace) -> int:
     exported folders are measured as in `legged evaluate onnx`. Tables are printed. Results of a checkpoint are written to
     evaluation_<physics>.json, or to motions_<physics>.json, and pictures.
     """
-    if _exported_file(args.policy) is not None:
+    if exported_file(args.policy) is not None:
         _check_plain(args)
         return onnx.run(onnx.parse([args.policy, *(["--out", str(args.out)] if args.out else [])]))
     with hint_at_sub_command("evaluate", [args.policy]):
-        setting = _settle(args, follows=False)
+        setting = settle(args, follows=False)
     cfg = setting.policy.cfg
     if tracks_motions(cfg):
         return evaluate_motions(setting, STARTS)
@@ -176,7 +176,7 @@ def grid(args: argparse.Namespace) -> int:
         args.physics = None
         if args.solver is not None:
             raise ConfigError(f"--solver: --physics {EVERYWHERE} measures with all solvers; leave one of the two options out")
-    setting = _settle(args)
+    setting = settle(args)
     cells = _grid_of(setting, args)
     return cross(setting, cells) if everywhere else evaluate_following(setting, cells)
 
@@ -194,7 +194,7 @@ def terrain(args: argparse.Namespace) -> int:
     evaluation_<physics>.json.
     """
     robots = check_points(args.robots_per_point, args.full)
-    setting = _settle(args)
+    setting = settle(args)
     cfg = setting.policy.cfg
     sizes = chosen_sizes(cfg, args.types, args.full, setting.cfg.terrain.scale)  # type: ignore[arg-type]
     if not sizes:
@@ -229,7 +229,7 @@ def stress(args: argparse.Namespace) -> int:
     for name in lines:
         if name not in NAMES:
             raise ConfigError(f"--lines: there is no line '{name}'{suggest(name, NAMES)}")
-    return evaluate_stress(Bench(_settle(args), robots, args.riser, args.tread, args.payload, lines), args.full)
+    return evaluate_stress(Bench(settle(args), robots, args.riser, args.tread, args.payload, lines), args.full)
 
 
 @sub_command(
@@ -258,7 +258,7 @@ def checkpoints(args: argparse.Namespace) -> int:
     check_number("--falls", args.falls, 0, 1, above=True)
     if args.checkpoint is not None:
         raise ConfigError("--checkpoint: leave it out, because all checkpoints of the run are measured")
-    setting = _settle(args)
+    setting = settle(args)
     return evaluate_all_checkpoints(setting, _grid_of(setting, args), args.rmse, args.falls)
 
 
@@ -278,7 +278,7 @@ def episodes(args: argparse.Namespace) -> int:
     The command is for tasks without velocity commands. The figures are printed and written to evaluation_<physics>.json.
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
-    setting = _settle(args, follows=False)
+    setting = settle(args, follows=False)
     if follows_velocities(setting.policy.cfg):
         task = setting.policy.cfg.task
         raise ConfigError(f"POLICY: '{task}' follows velocity commands; use `legged evaluate grid {task}`")
@@ -298,7 +298,7 @@ def motions(args: argparse.Namespace) -> int:
     motions_<physics>.json.
     """
     check_number("--episodes", args.episodes, 1, MOST_EPISODES)
-    setting = _settle(args, follows=False)
+    setting = settle(args, follows=False)
     if not tracks_motions(setting.policy.cfg):
         raise ConfigError(f"POLICY: '{setting.policy.cfg.task}' tracks no motions; use `legged evaluate`")
     return evaluate_motions(setting, args.episodes)
@@ -319,7 +319,7 @@ def gymnasium(args: argparse.Namespace) -> int:
     for option in ("physics", "solver", "sim_device"):
         if getattr(args, option) is not None:
             raise ConfigError(f"--{option.replace('_', '-')}: leave it out, because Gymnasium simulates the robots")
-    return evaluate_in_gymnasium(_settle(args, follows=False), args.episodes)
+    return evaluate_in_gymnasium(settle(args, follows=False), args.episodes)
 
 
 # ---- ONNX files ------------------------------------------------------------------------------------------------------
@@ -384,10 +384,10 @@ def onnx(args: argparse.Namespace) -> int:
     if args.friction is not None and not 0.0 <= args.friction <= 10.0:
         raise ConfigError(f"--friction: must be from 0 to 10, got {args.friction}")
     commands = [velocity_command(text) for text in args.command or ()] or COMMANDS
-    files = [_file(name) for name in args.policy]
+    files = [onnx_file(name) for name in args.policy]
     if args.out is not None:
         ready_to_write(args.out)
-    layouts = [read_layout(args.layout or str(_description(path, files[0])), "--layout") for path in files]
+    layouts = [read_layout(args.layout or str(description_of(path, files[0])), "--layout") for path in files]
     if layouts[0].task:
         return _replay(files, layouts, args)
     args.friction = FRICTION if args.friction is None else args.friction
@@ -445,7 +445,7 @@ def _trackers(file: Path, layout: Layout) -> list[Path]:
     return [file.with_name(name) for name in layout.contract.trackers]
 
 
-def _exported_file(name: str) -> Path | None:
+def exported_file(name: str) -> Path | None:
     """Return the ONNX file `name`, or the ONNX file in the exported folder `name`; None if `name` is something else."""
     path = Path(name)
     if path.suffix == ".onnx":
@@ -454,15 +454,15 @@ def _exported_file(name: str) -> Path | None:
     return inside if exists(inside) and not exists(path / CONFIG_FILE) else None
 
 
-def _file(name: str) -> Path:
+def onnx_file(name: str) -> Path:
     """Return the ONNX file `name`, or the ONNX file in the exported folder `name`. Raise ConfigError if neither exists."""
-    path = _exported_file(name)
+    path = exported_file(name)
     if path is None or not exists(path) or not path.is_file():
         raise ConfigError(f"POLICY: there is no ONNX file '{name}', and no exported folder (with {EXPORTED[0]}) of this name")
     return path
 
 
-def _description(file: Path, first: Path) -> Path:
+def description_of(file: Path, first: Path) -> Path:
     """Return the policy.json next to `file`, or else the policy.json next to `first`."""
     path = next((path for path in (file.with_name(EXPORTED[1]), first.with_name(EXPORTED[1])) if exists(path)), None)
     if path is None:

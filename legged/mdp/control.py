@@ -147,6 +147,12 @@ class Control:
             return
         torch.add(middle, self.spread(actions), out=self._target)
 
+    def aim(self, joints: Tensor, targets: Tensor) -> None:
+        """Replace the targets of some joints, until the next `set_actions`: `targets` (N, K) [rad] for the joints with the
+        indices `joints` (K,), whose law is P.
+        """
+        self._target.index_copy_(1, joints, targets)
+
     def _middle(self) -> Tensor:
         """Return the targets of action 0, (D,), (N, D) or ()."""
         if not self.law:

@@ -181,7 +181,7 @@ def was_trained_with_other_motors(contract: Contract) -> bool:
 
 
 class ForeignPolicy:
-    """A policy on one robot with D joints. Arguments and results have the robot's joint order; the network has its own."""
+    """A policy of robots with D joints. Arguments and results have the robot's joint order; the network has its own."""
 
     def __init__(self, path: Path, layout: Layout, robot: Robot) -> None:
         """Load the ONNX file at `path`. The attribute `metadata` holds the texts in the file's metadata by name.
@@ -238,7 +238,7 @@ class ForeignPolicy:
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if len(inputs) != 1 or len(inputs[0].shape) != 2 or len(outputs[0].shape) != 2:
             raise ConfigError(f"{self._path}: expected one input of shape (1, numbers), got {[i.shape for i in inputs]}")
-        self._input = inputs[0].name
+        self._input, self._any_batch = inputs[0].name, not isinstance(inputs[0].shape[0], int)
         zeros = np.zeros(3)
         width = len(self._observe(zeros, zeros, zeros, zeros, self.default, self.default))
         if isinstance(inputs[0].shape[1], int) and inputs[0].shape[1] != width:
@@ -248,10 +248,10 @@ class ForeignPolicy:
             raise ConfigError(f"{self._path}: gives {outputs[0].shape[1]} actions, but {count} joints have an action")
         warm_up(self._path, self._session, {self._input: np.zeros((1, width), dtype=np.float32)})
 
-    def reset(self) -> None:
-        """Start an episode."""
-        self._actions = np.zeros(len(self._acted))
-        self._phase = np.array(self.layout.phase_offsets, dtype=float)
+    def reset(self, *robots: int) -> None:
+        """Start an episode of one robot, or of so many robots. The arguments and results of `act` then have as many rows."""
+        self._actions = np.zeros((*robots, len(self._acted)))
+        self._phase = np.broadcast_to(np.array(self.layout.phase_offsets), (*robots, len(self.layout.phase_offsets))).copy()
 
     def act(
         self,
@@ -262,7 +262,7 @@ class ForeignPolicy:
         dof_pos: np.ndarray,
         dof_vel: np.ndarray,
     ) -> np.ndarray:
-        """Return joint targets (D,) [rad] for the next `control_dt`.
+        """Return joint targets (D,) [rad] for the next `control_dt`. After `reset(N)`, targets and arguments have N rows.
 
         Raises:
             ConfigError: the network's output is not finite.
@@ -276,31 +276,34 @@ class ForeignPolicy:
             dof_vel: joint velocities (D,) [rad/s].
         """
         standing = self.layout.phase_standing
-        if standing is not None and not np.any(command):
-            self._phase[:] = standing
+        if standing is not None:
+            self._phase[~np.any(command, axis=-1)] = standing
         observation = self._observe(command, lin_vel, ang_vel, gravity, dof_pos, dof_vel)
-        actions = self._session.run(None, {self._input: observation[None].astype(np.float32)})[0][0]
+        rows = np.atleast_2d(observation).astype(np.float32)
+        each = [rows] if self._any_batch else rows[:, None]
+        outputs = [self._session.run(None, {self._input: part})[0] for part in each]
+        actions = np.concatenate(outputs).reshape(self._actions.shape)
         if not np.isfinite(actions).all():
             raise ConfigError(f"{self._path}: gives actions that are not finite")
         self._actions = np.clip(actions, -self.layout.action_clip, self.layout.action_clip).astype(float)
         self._phase += 2.0 * np.pi * self.layout.control_dt / self.layout.phase_period_s
-        targets = self.default.copy()
-        targets[self._acted] += self._scale * self._actions
+        targets = np.broadcast_to(self.default, np.shape(dof_pos)).copy()
+        targets[..., self._acted] += self._scale * self._actions
         return targets
 
     def _observe(self, command: Any, lin_vel: Any, ang_vel: Any, gravity: Any, dof_pos: Any, dof_vel: Any) -> np.ndarray:
-        """Return the observation, (width,)."""
+        """Return the observation, (width,) or (N, width)."""
         terms = {
             "base_lin_vel": lin_vel + np.cross(ang_vel, self.layout.velocity_point),
             "base_ang_vel": ang_vel,
             "projected_gravity": gravity,
-            "command_xy": command[:2],
-            "command_yaw": command[2:],
-            "dof_pos": (dof_pos - self.default)[self._order],
-            "dof_vel": dof_vel[self._order],
+            "command_xy": command[..., :2],
+            "command_yaw": command[..., 2:],
+            "dof_pos": (dof_pos - self.default)[..., self._order],
+            "dof_vel": dof_vel[..., self._order],
             "actions": self._actions,
             "phase_sin": np.sin(self._phase),
             "phase_cos": np.cos(self._phase),
         }
-        columns = np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()])
+        columns = np.concatenate([scale * terms[name] for name, scale in self.layout.observation.items()], axis=-1)
         return np.clip(columns, -self.layout.observation_clip, self.layout.observation_clip)

@@ -1,0 +1,218 @@
+"""Runs of a policy in the league: stages, scores, table and file."""
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged.config import LeggedConfig, follows_velocities
+from legged.config.actuator import ActuatorConfig
+from legged.errors import ConfigError
+from legged.evaluation.intervals import bootstrap_mean, wilson
+from legged.evaluation.league.protocol import ARM_JOINTS, CONTROL_DT, POINTS, RUN_S
+from legged.evaluation.league.robot import OURS, servo_gains, write_robot
+from legged.evaluation.league.task import SLOT, STAGES, Course, LeagueTask, make_league
+from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
+from legged.evaluation.result_file import device_name, write_result
+from legged.mdp.control import control_gains
+from legged.physics import engine_name, resolve_physics
+from legged.policies.foreign import ForeignPolicy, Layout
+from legged.policies.restore import nominal, restore, undisturbed
+from legged.process.paths import relative
+from legged.registry import task_config
+from legged.robots.robot import Robot, load_robot
+from legged.tables import screen_table
+
+MOST_RUNS = 2**16
+"""Largest number of runs of a stage."""
+TASK = "g1_flat"
+"""Task in which ONNX policies run. Only its robot matters for them."""
+SOLVER = {"dt": 0.002, "impratio": 1.0, "iterations": 100, "ls_iterations": 50, "nconmax": 64, "njmax": 320}
+"""Settings of the section `sim`: MuJoCo's defaults, and memory for a robot that lies on the ground."""
+AT_ONCE_S = 1.0
+"""Simulated time after which the runs are asked whether all have ended [s]."""
+Act = Callable[[LeagueTask, TensorDict], Tensor]
+"""Task and observations -> actions (N, A)."""
+
+
+def rules(cfg: LeggedConfig, runs: int, robot: Robot, gains: tuple[np.ndarray, np.ndarray]) -> list[tuple[str, Any]]:
+    """Return the overrides that make a task run under the league's rules, on its robot with the gains (D,) each."""
+    tables = (dict(zip(robot.joint_names, values.tolist(), strict=True)) for values in gains)
+    return [
+        *undisturbed(cfg, runs, RUN_S),
+        ("robot", str(robot.folder)),
+        ("terrain.mesh_type", "plane"),
+        *zip(("control.stiffness", "control.damping"), tables, strict=True),
+        *((f"sim.{name}", value) for name, value in SOLVER.items()),
+        ("sim.self_collisions", True),
+        ("control.decimation", round(CONTROL_DT / SOLVER["dt"])),
+        ("rewards.scales", dict.fromkeys(cfg.rewards.scales, 0.0)),
+    ]
+
+
+def with_ideal_motors(cfg: LeggedConfig) -> LeggedConfig:
+    """Return a configuration with motors that give the torques of the PD law, up to their limits."""
+    return replace(cfg, control=replace(cfg.control, actuator=ActuatorConfig()))
+
+
+def gains_of(stage: str, robot: Robot, own: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the gains (D,) of a stage: the policy's, `own`. In all stages except `own`, the arms have the league's gains."""
+    arms = np.array([name.endswith(ARM_JOINTS) for name in robot.joint_names]) & (stage != "own")
+    stiffness, damping = (np.where(arms, league, given) for league, given in zip(servo_gains(robot), own, strict=True))
+    return stiffness, damping
+
+
+@torch.inference_mode()
+def run_tours(task: LeagueTask, act: Act) -> int:
+    """Let all robots run their tours, until the end or until all have fallen. The scores are attributes of the task. Return
+    how often a robot lost contacts in a control step, because memory was full.
+    """
+    observations, overflows = task.reset(), Overflows()
+    for step in range(POINTS * SLOT):
+        observations, _, _, extras = task.step(act(task, observations))
+        overflows.add(extras)
+        if step % round(AT_ONCE_S / CONTROL_DT) == 0 and not task.alive.any():
+            break
+    return overflows.total(task)
+
+
+def scores(task: LeagueTask) -> dict[str, Any]:
+    """Return the scores of tours as plain numbers: means, and a list with the figures of each run."""
+    lasted, alive = task.lasted.cpu().numpy() * CONTROL_DT, task.alive.cpu().numpy()
+    missed, energy = task.missed.cpu().numpy(), task.energy.cpu().numpy()
+    ends = SLOT * CONTROL_DT * np.arange(1, POINTS + 1)
+    reached = alive[:, None] | (lasted[:, None] > ends + 0.5 * CONTROL_DT)
+
+    def mean(values: np.ndarray) -> float | None:
+        return float(values.mean()) if len(values) else None
+
+    runs = [
+        {"survival_s": round(float(time), 2), "completed": bool(ended), "slots": int(slots.sum())}
+        for time, ended, slots in zip(lasted, alive, reached, strict=True)
+    ]
+    completed = int(alive.sum())
+    return {
+        "survival_s": float(lasted.mean()),
+        "interval": bootstrap_mean(lasted.tolist()),
+        "completed": completed / len(alive),
+        "completed_interval": wilson(completed, len(alive)),
+        "position_error_m": mean(missed[reached, 0]),
+        "yaw_error_rad": mean(missed[reached, 1]),
+        "energy_j": mean(energy[alive]),
+        "runs": runs,
+    }
+
+
+def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]) -> int:
+    """Measure a trained policy in the league: the runs with the ids `runs` in each of `stages`. Print a table, write
+    league_<physics>.json, and return the exit code.
+
+    Raises:
+        ConfigError: the policy's robot is not the G1 of this package.
+        RunError: the file can't be written.
+    """
+    start, cfg = time.perf_counter(), setting.cfg
+    own = load_robot(cfg.robot)
+    if own.folder != load_robot(OURS).folder:
+        raise ConfigError(f"POLICY: the league's robot is '{OURS}', but '{setting.policy.cfg.task}' has '{own.name}'")
+    assert follows_velocities(setting.policy.cfg)
+    policy, ranges = replace(setting.policy, cfg=with_ideal_motors(setting.policy.cfg)), cfg.commands.ranges
+    limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
+
+    def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
+        gains = gains_of(stage, robot, control_gains(own, cfg.control))
+        changes = [*rules(cfg, len(runs), robot, gains), *setting.asked]
+        make = partial(make_league, Course.of(stage, runs, robot, limits))
+        task, actor = restore(policy, changes, setting.device, setting.graph, None, make)
+        return task, lambda _, observations: actor(observations)
+
+    found = measure_stages(build, stages)
+    head = {**setting.head, **setting.changes, "wall_s": time.perf_counter() - start}
+    report({**head, **found}, list(runs), setting.folder / f"league_{setting.engine}.json")
+    return 0
+
+
+def evaluate_foreign(
+    file: Path,
+    layout: Layout,
+    runs: Sequence[int],
+    stages: Sequence[str],
+    device: torch.device,
+    overrides: Sequence[tuple[str, Any]],
+    folder: Path,
+) -> int:
+    """Measure an ONNX policy in the league, as `evaluate_league` does for a trained one. Commands are within the ranges of
+    the policy's contract, or from -1 to 1 without a contract. The file league_<physics>.json goes to `folder`.
+
+    Raises:
+        ConfigError: the policy or its layout does not fit the robot, or its control step is not the league's.
+        RunError: the file can't be written.
+    """
+    start = time.perf_counter()
+    cfg = task_config(TASK, [("sim.physics", resolve_physics("auto", device)), *overrides])
+    assert follows_velocities(cfg)
+    if abs(layout.control_dt - CONTROL_DT) > 1e-9:
+        raise ConfigError(f"layout: control_dt: must be {CONTROL_DT} in the league, got {layout.control_dt}")
+    limits = layout.contract.command_ranges if layout.contract is not None else np.array([(-1.0, 1.0)] * 3)
+
+    def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
+        foreign = ForeignPolicy(file, layout, robot)
+        gains = gains_of(stage, robot, (foreign.stiffness, foreign.damping))
+        targets = [("control.action_scale", 1.0), ("control.clip_actions", 1000.0)]
+        changes = nominal(cfg, [*rules(cfg, len(runs), robot, gains), *targets])
+        foreign.reset(len(runs))
+        task = make_league(Course.of(stage, runs, robot, limits), changes, device, True, None)
+        return task, partial(_act, foreign)
+
+    found = measure_stages(build, stages)
+    engine = engine_name(cfg.sim, device)
+    head = {"file": str(file), "physics": engine, "device": device_name(device), "wall_s": time.perf_counter() - start}
+    report({**head, **found}, list(runs), folder / f"league_{engine}.json")
+    return 0
+
+
+def _act(foreign: ForeignPolicy, task: LeagueTask, _: TensorDict) -> Tensor:
+    """Return the actions with which the task's joints have the targets of an ONNX policy."""
+    state = (task.commands[:, :3], task.base_lin_vel, task.base_ang_vel, task.projected_gravity, task.dof_pos, task.dof_vel)
+    targets = foreign.act(*(values.double().cpu().numpy() for values in state))
+    return torch.as_tensor(targets - task.robot.default_dof_pos, dtype=torch.float32)
+
+
+def measure_stages(build: Callable[[str, Robot], tuple[LeagueTask, Act]], stages: Sequence[str]) -> dict[str, Any]:
+    """Run the tours of each stage, and return stage -> scores under `stages`, and `contact_overflows`. `build` makes a task
+    and its policy for a stage, on the league's robot.
+    """
+    found, lost = {}, 0
+    with tempfile.TemporaryDirectory() as folder:
+        robot = load_robot(str(write_robot(Path(folder))))
+        for stage in stages:
+            task, act = build(stage, robot)
+            lost += run_tours(task, act)
+            found[stage] = scores(task)
+            print(f"{stage}: {found[stage]['survival_s']:.1f} s", flush=True)
+    return {"stages": found, "contact_overflows": lost}
+
+
+def report(result: dict[str, Any], runs: Sequence[int], path: Path) -> None:
+    """Print the table of a result, and write the result to `path`."""
+    rows = []
+    for stage, found in result["stages"].items():
+        interval = "" if found["interval"] is None else "{:.1f} to {:.1f}".format(*found["interval"])
+        errors = (found["position_error_m"], found["yaw_error_rad"], found["energy_j"])
+        texts = ["-" if value is None else f"{value:.{digits}f}" for value, digits in zip(errors, (3, 2, 0), strict=True)]
+        rows.append([stage, f"{found['survival_s']:.1f}", interval, f"{100 * found['completed']:.0f} %", *texts])
+    heads = ("stage", "survival [s]", "95 %", "completed", "position error [m]", "yaw error [rad]", "energy [J]")
+    name = f"{result.get('task', result.get('file'))} in {result['physics']}: {len(runs)} runs of {RUN_S:g} s"
+    Console(width=120).print(screen_table(name, heads, rows))
+    warn_of_overflows("league", result["contact_overflows"])
+    write_result(path, {**result, "first_run": runs[0], "definition": STAGES})
+    print(f"written: {relative(path)}")
