@@ -32,6 +32,10 @@ class CommandRanges:
     widens."""
     heading: Range = field(default=(-3.141592653589793, 3.141592653589793), metadata=quantity("rad", MOTION))
     """Heading in the world frame [rad]. It is used only in heading mode."""
+    base_height: Range = field(default=(0.0, 0.0), metadata=rescaled("m", between(0, 100)))
+    """Height of the base above the ground [m]; [0, 0] for rewards.base_height_target."""
+    base_pitch: Range = field(default=(0.0, 0.0), metadata=quantity("rad", between(-1.5, 1.5)))
+    """Pitch of the base, positive if it leans forward [rad]."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,28 @@ class CommandCurriculumConfig:
 
 
 @dataclass(frozen=True)
+class WaypointsConfig:
+    """Waypoints: places and headings to which some robots walk. New waypoints come with the times of new commands. Velocity
+    commands are proportional to the error in the yaw frame, and within the ranges of the commands.
+    """
+
+    share: float = field(default=0.0, metadata=UNIT)
+    """Share of the robots that walk to waypoints. The others have sampled velocities."""
+    radius: float = field(default=0.75, metadata=rescaled("m", between(0, 1000)))
+    """Radius of the disc in which places are sampled uniformly [m]. Headings are uniform."""
+    ahead: float = field(default=0.3, metadata=rescaled("m", between(-1000, 1000)))
+    """Distance of the disc's centre ahead of the pose in which the episode began [m]."""
+    gain: float = field(default=1.5, metadata=quantity("1/s", between(0, 100)))
+    """Commanded velocity per error [1/s]."""
+    place_error: Range = field(default=(0.1, 0.2), metadata=quantity("m", between(0, 100)))
+    """Distance from the place below which the robot rests, and distance above which it walks again [m]."""
+    heading_error: Range = field(default=(0.05, 0.12), metadata=quantity("rad", between(0, 100)))
+    """Error of the heading below which the robot does not turn, and error above which it turns again [rad]."""
+
+
+@dataclass(frozen=True)
 class CommandsConfig(Section):
-    """Velocity commands: ranges, heading mode, curriculum."""
+    """Velocity commands: ranges, heading mode, waypoints, curriculum."""
 
     ranges: CommandRanges = CommandRanges()
     """Ranges of the commands on each axis."""
@@ -66,6 +90,8 @@ class CommandsConfig(Section):
     """Share of the sampled commands that are zero, so that the robot stands still."""
     single_axis_share: float = field(default=0.0, metadata=UNIT)
     """Share of the moving commands that use a single random axis: walking straight, walking sideways, or turning in place."""
+    waypoints: WaypointsConfig = WaypointsConfig()
+    """Waypoints that some robots walk to."""
     curriculum: CommandCurriculumConfig = CommandCurriculumConfig()
     """Curriculum that widens the ranges during training."""
 

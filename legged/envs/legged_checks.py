@@ -154,6 +154,17 @@ def check_robot(cfg: RobotConfig, robot: Robot) -> None:
         raise cfg.origins.error("terrain.measured_points_x", f"{text}, more than {MOST_POINTS:,}")
 
 
+def check_commands(cfg: LeggedConfig) -> None:
+    """Check commands of the base's height.
+
+    Raises:
+        ConfigError: a height can be 0.
+    """
+    low, high = cfg.commands.ranges.base_height
+    if high > 0.0 and low <= 0.0:
+        raise cfg.origins.error("commands.ranges.base_height", f"must be above 0 [m], or [0, 0], got [{low:g}, {high:g}]")
+
+
 def check_grid(cfg: LeggedConfig) -> None:
     """Check each axis of evaluation's grid of commands.
 

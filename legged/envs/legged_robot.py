@@ -11,12 +11,14 @@ from torch import Tensor
 from legged.config.legged import LeggedConfig, follows_velocities
 from legged.config.task import TaskConfig
 from legged.envs.base_task import BaseTask
-from legged.envs.legged_checks import check_grid
+from legged.envs.legged_checks import check_commands, check_grid
 from legged.envs.legged_gym_names import LeggedGymNames
 from legged.envs.robot_task import RobotTask
 from legged.envs.velocity_terms import VelocityTerms
+from legged.mdp.base_commands import BaseCommands
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
+from legged.mdp.waypoints import Waypoints
 
 
 class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
@@ -33,6 +35,7 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         super().check(cfg)
         assert follows_velocities(cfg)
         check_grid(cfg)
+        check_commands(cfg)
 
     def _init_buffers(self) -> None:
         """Allocate tensors and parts for the robot, its ground, its commands and their curriculum."""
@@ -44,6 +47,10 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
     def make_commands(self) -> None:
         sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.kernels, self.numbers)
         self.command_sampler, self.commands, self.is_moving = sampler, sampler.commands, sampler.is_moving
+        cfg, height = self.cfg.commands, self.cfg.rewards.base_height_target
+        self.base_sampler = BaseCommands(cfg.ranges, height, self.numbers)
+        self.base_commands = self.base_sampler.commands
+        self.waypoints = Waypoints(cfg.waypoints, sampler, self.numbers) if cfg.waypoints.share else None
 
     def observation_scales(self) -> dict[str, Any]:
         """Return the factor on each observation. By default, commands have the factors of base_lin_vel and base_ang_vel."""
@@ -67,15 +74,20 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
             self.terrain_curriculum.update(self.reset_buf, self.valid, *step)
 
     def ask(self) -> None:
-        """Give robots their next commands when these are due, and steer towards headings."""
+        """Give robots their next commands when these are due, and steer towards headings and waypoints."""
         self.command_sampler.update(self.reset_buf, self.base_quat)
+        if self.waypoints is not None:
+            self.waypoints.steer(self.reset_buf, self.base_pos, self.base_quat)
+        self.base_sampler.update(self.command_sampler)
 
     @torch.no_grad()
     def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
         """Hold `commands` (N, 3) or (3,): vx, vy [m/s] and yaw rate [rad/s], until the next call. Return the observations.
-        If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead.
+        If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead. The base has
+        its usual height and no pitch.
         """
         self.command_sampler.hold(commands, heading)
+        self.base_sampler.hold()
         self.observation_terms.evaluate(self.episode_length_buf == 0, again=True)
         for group in self.observation_groups.values():
             group.compute()
@@ -103,7 +115,9 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         self.command_curriculum.write_ranges(self.command_sampler.ranges)
 
     def parts(self) -> dict[str, Any]:
-        return {**super().parts(), "commands": self.command_sampler, "command_curriculum": self.command_curriculum}
+        own = {"commands": self.command_sampler, "base_commands": self.base_sampler}
+        parts = {**super().parts(), **own, "command_curriculum": self.command_curriculum}
+        return parts if self.waypoints is None else {**parts, "waypoints": self.waypoints}
 
 
 def is_velocity_task(task: BaseTask) -> TypeGuard[LeggedRobot]:

@@ -18,13 +18,15 @@ class VelocityTerms(RobotTerms):
     configuration can name, and metrics `_metric_<name>`. N robots.
     """
 
-    MIRRORED: dict[str, MirrorKind] = {**RobotTerms.MIRRORED, "commands": "command"}
+    MIRRORED: dict[str, MirrorKind] = {**RobotTerms.MIRRORED, "commands": "command", "base_commands": "same"}
     cfg: LeggedConfig
     commands: Tensor
     """(N, 4) commanded vx, vy [m/s], yaw rate [rad/s] and heading [rad]. `is_moving` (N,) is True if any motion is
     commanded.
     """
     is_moving: Tensor
+    base_commands: Tensor
+    """(N, 2) commanded height of the base above the ground [m] and pitch [rad], positive if it leans forward."""
 
     # ---- observations: (N, width) each; docstrings and units go into policy.json -----------------------------------------
 
@@ -32,6 +34,11 @@ class VelocityTerms(RobotTerms):
     def _obs_commands(self) -> Tensor:
         """Commanded vx (forward), vy (leftward) and yaw rate (left positive), in the base frame [m/s, m/s, rad/s]."""
         return self.commands[:, :3]
+
+    @unit("m, rad")
+    def _obs_base_commands(self) -> Tensor:
+        """Commanded height of the base above the ground, and pitch, positive if it leans forward [m, rad]."""
+        return self.base_commands
 
     # ---- rewards: (N,) each, before the multiplication by scale and control step ---------------------------------------
 
@@ -48,6 +55,24 @@ class VelocityTerms(RobotTerms):
         """Following the commanded yaw rate: exp(-error^2 / sigma)."""
         error = yaw_rate_error(self.commands, self.base_ang_vel)
         return torch.exp(error * (-1.0 / self.cfg.rewards.tracking_sigma))
+
+    @concurrent
+    @unit("m^2")
+    def _reward_height_error(self) -> Tensor:
+        """Squared difference between the base's height above the mean of the scanned ground and its command [m^2]. It takes
+        the place of `base_height` under commands of the height.
+        """
+        height = self.base_pos[:, 2] - self.measured_heights.mean(dim=1)
+        return (height - self.base_commands[:, 0]).square()
+
+    @concurrent
+    @unit("1")
+    def _reward_tilt_error(self) -> Tensor:
+        """Leaning otherwise than commanded: sum of the squared differences between x and y of `projected_gravity` and those
+        of a base with the commanded pitch and no roll. It takes the place of `orientation` under commands of the pitch.
+        """
+        forward = self.projected_gravity[:, 0] - self.base_commands[:, 1].sin()
+        return forward.square() + self.projected_gravity[:, 1].square()
 
     @concurrent
     @unit("s")

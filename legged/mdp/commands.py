@@ -106,6 +106,11 @@ class Commands:
         written = (self.commands, self.standing, self.time_left, self.is_moving)
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
+    @property
+    def renewed(self) -> Tensor:
+        """(N,) True for robots that got a new command in the last `update`."""
+        return self.time_left > self.cfg.resampling_time_s - 0.5 * self.dt
+
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Set fixed commands, (N, 3) or one (3,) for all robots. They are not sampled any more. With `heading` (N,) [rad] and
         in heading mode, the yaw rate keeps steering towards that heading.

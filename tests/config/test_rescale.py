@@ -87,7 +87,7 @@ def test_rewards_whose_unit_is_one():
     counted = {name for name in LeggedRobot.terms("_reward_") if unit_of(getattr(LeggedRobot, f"_reward_{name}")) == "1"}
     tracking = {"tracking_lin_vel", "tracking_ang_vel"}
     counts = {"collision", "self_collision", "termination", "stumble", "no_fly"}
-    assert counted == tracking | counts | {"orientation", "action_rate"}
+    assert counted == tracking | counts | {"orientation", "tilt_error", "action_rate"}
 
 
 @pytest.mark.parametrize("text", ["metres", "", "m^", "[m]", 3])

@@ -132,7 +132,10 @@ def test_what_is_no_contract_is_refused_in_one_line(changes, says, folder, tmp_p
         ({"name": "my_gyro"}, "'my_gyro' cannot be made from 'gyro'"),
         ({"needs": "quaternion"}, "'base_ang_vel' cannot be made from 'quaternion'"),
         ({"size": 2, "scale": [1.0, 1.0]}, "'base_ang_vel' has 2 numbers, but a robot gives 3"),
-        ({"name": "dof_pos", "needs": "joint positions", "joints": ["arm"] * 3}, r"is no policy\.json .* 'arm' is not in list"),
+        (
+            {"name": "dof_pos", "needs": "joint positions", "joints": ["arm"] * 3},
+            r"is no policy\.json .* 'arm' is not in list",
+        ),
         (
             {"name": "dof_pos", "needs": "joint positions", "joints": ["LF_HAA"]},
             "'dof_pos' has 3 numbers, but a robot gives 1",

@@ -262,7 +262,8 @@ def test_what_no_kind_of_mirror_fits_is_refused(robot):
     task = small_task()
 
     def images(kinds):
-        return MirrorImages("Mine", kinds, task.observation_groups, robot, range(12), task.height_scan.points)
+        joints = dict.fromkeys(("actions", "angles", "speeds"), range(12))
+        return MirrorImages("Mine", kinds, task.observation_groups, robot, joints, task.height_scan.points)
 
     assert images(LeggedRobot.MIRRORED).actions[0].tolist() == list(robot.mirror.joints)
     with pytest.raises(ConfigError, match=r"Mine\.MIRRORED: there is no way to mirror 'typo'"):

@@ -18,6 +18,8 @@ TERMS = [
     "ang_vel_xy",
     "orientation",
     "base_height",
+    "height_error",
+    "tilt_error",
     "torques",
     "dof_vel",
     "dof_acc",
@@ -142,6 +144,19 @@ def test_orientation_squares_the_horizontal_part_of_gravity(task):
 def test_base_height_squares_the_distance_to_the_target(task):
     task.base_pos.copy_(torch.tensor([[3.0, 4.0, 0.4], [0.0, 0.0, 0.8]]))
     assert value(task, "base_height") == near(0.01, 0.09)
+
+
+def test_height_error_squares_the_distance_to_the_commanded_height(task):
+    task.base_pos.copy_(torch.tensor([[3.0, 4.0, 0.4], [0.0, 0.0, 0.8]]))
+    task.base_commands[:, 0] = torch.tensor([0.6, 0.8])
+    assert value(task, "height_error") == near(0.04, 0.0)
+
+
+def test_tilt_error_squares_what_leans_otherwise_than_commanded(task):
+    """Leaning forward by 0.1 rad moves gravity forward by its sine; a roll counts as in `orientation`."""
+    task.projected_gravity.copy_(torch.tensor([[math.sin(0.1), 0.0, -math.cos(0.1)], [math.sin(0.1), 0.2, -0.97]]))
+    task.base_commands[:, 1] = torch.tensor([0.3, 0.1])
+    assert value(task, "tilt_error") == near((math.sin(0.3) - math.sin(0.1)) ** 2, 0.04)
 
 
 def test_torques_are_squared_and_summed(task):

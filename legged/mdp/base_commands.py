@@ -1,0 +1,37 @@
+"""Commands of the base's height and pitch, sampled together with velocity commands."""
+
+import torch
+
+from legged.config.legged import CommandRanges
+from legged.math import masked_set_
+from legged.mdp.commands import Commands
+from legged.mdp.random_pool import RandomPool
+
+
+class BaseCommands:
+    """Commanded height above the ground [m] and pitch [rad] of the bases of N robots."""
+
+    STATE: tuple[str, ...] = ()
+
+    def __init__(self, cfg: CommandRanges, height: float, numbers: RandomPool) -> None:
+        """Command the height `height` [m] and no pitch, until `update` samples others. A range of zero width at 0 keeps these
+        values. Random numbers come from the pool `numbers`.
+        """
+        self.usual = torch.tensor([height, 0.0], device=numbers.device)
+        """(2,) height and pitch that are commanded without a range, and while velocity commands are held."""
+        self.commands = self.usual.repeat(numbers.num_envs, 1)
+        """(N, 2) commanded height [m] and pitch [rad], positive if the base leans forward."""
+        spans = cfg.base_height if any(cfg.base_height) else (height, height), cfg.base_pitch
+        self._drawn = None
+        if any(cfg.base_height) or any(cfg.base_pitch):
+            low, high = zip(*spans, strict=True)
+            self._drawn, self.STATE = numbers.between(low, high, 2), ("commands",)
+
+    def update(self, velocity: Commands) -> None:
+        """Give new commands to the robots whose command of a velocity is new."""
+        if self._drawn is not None:
+            masked_set_(self.commands, velocity.renewed, self._drawn.values)
+
+    def hold(self) -> None:
+        """Command the usual height and pitch."""
+        self.commands.copy_(self.usual)
