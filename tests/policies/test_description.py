@@ -171,7 +171,7 @@ def test_noise_is_that_of_the_training_and_not_of_the_task_that_is_exported_from
 def test_every_shipped_term_has_a_formula_and_a_unit():
     """Of a robot that has something to say for each of them."""
     measured = sorted(LeggedRobot.terms("_obs_") - {"push_force"} - {f"rand_{name}" for name in FIELDS})  # not privileged
-    every = [("robot", "cassie"), ("observations.groups.actor.terms", measured)]
+    every = [("robot", "cassie"), ("control.held", ["foot"]), ("observations.groups.actor.terms", measured)]
     task = make_task(task_config("anymal_c", [("env.num_envs", 1), *ENGINE, *SMALL_TERRAIN, *every], on_cpu=True))
     terms = {term["name"]: term for term in describe(task)["observation"]}
     assert set(terms) == set(measured)
@@ -181,6 +181,8 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
         "base_ang_vel": "rad/s",
         "projected_gravity": "1",
         "commands": "m/s, m/s, rad/s",
+        "base_commands": "m, rad",
+        "held_targets": "rad",
         "dof_pos": "rad",
         "dof_vel": "rad/s",
         "actions": "1",
@@ -192,9 +194,11 @@ def test_every_shipped_term_has_a_formula_and_a_unit():
     assert frames == {
         **dict.fromkeys(("base_lin_vel", "base_ang_vel", "projected_gravity", "commands"), "base frame"),
         **dict.fromkeys(("dof_pos", "dof_vel", "actions", "passive_pos", "passive_vel"), None),
+        **dict.fromkeys(("base_commands", "held_targets"), None),
         "heights": "yaw frame",
     }
     assert all(term["formula"].endswith(f"[{term['unit']}].") for term in terms.values())
+    assert len(terms["held_targets"]["joints"]) == terms["held_targets"]["size"] == 2
     assert terms["passive_pos"]["joints"][:2] == ["left_shin", "left_tarsus"]
     assert terms["passive_pos"]["default"][:2] == pytest.approx([0.0, 1.4214], abs=1e-3)
     heights = terms["heights"]
