@@ -209,7 +209,7 @@ class LeagueTask(LeggedRobot):
         self.missed[self._rows, slot] = torch.where(walks.unsqueeze(1), missed, self.missed[self._rows, slot])
         ahead, aside = torch.cos(yaw), torch.sin(yaw)
         asked = [ahead * way[:, 0] + aside * way[:, 1], ahead * way[:, 1] - aside * way[:, 0], turn]
-        stays = self._reached[:, [0, 0, 1]]
+        stays = torch.cat([self._reached[:, :1], self._reached], dim=1)  # of vx, vy, yaw rate
         commands = torch.where(stays, 0.0, GAIN * torch.stack(asked, dim=1))
         self.command_sampler.hold(commands.clamp(self._limits[:, 0], self._limits[:, 1]))
         self.base_sampler.hold()
