@@ -1,4 +1,4 @@
-"""What the league asks of a run: waypoints, goals of the arms, and punches. They follow from the run's id alone."""
+"""Waypoints, goals of the arms, and punches of the league's runs. They follow from a run's id alone."""
 
 import math
 from collections.abc import Sequence

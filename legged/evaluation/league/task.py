@@ -109,6 +109,8 @@ class LeagueTask(LeggedRobot):
         names = self.robot.joint_names
         arms = [names.index(f"{side}_{name}") for side in ("left", "right") for name in protocol.ARM_JOINTS]
         self._arms = tensor(arms, torch.long)
+        held = [(column, arms.index(joint)) for column, joint in enumerate(self.control.held) if joint in arms]
+        self._held, self._of_held = tensor(held, torch.long).view(-1, 2).unbind(dim=1)
         self._goals = tensor(np.concatenate([course.goals, course.goals * protocol.MIRROR], axis=2))
         self._points, self._limits = tensor(course.points), tensor(course.limits)
         self._rows = torch.arange(n, device=torch.device(self.device))
@@ -151,11 +153,14 @@ class LeagueTask(LeggedRobot):
     def set_controls(self) -> None:
         super().set_controls()
         if self.course.stage != "own":
-            # At the first control step the arms are still.
-            step = self.episode_length_buf.clamp(max=POINTS * SLOT - 1)
-            goal, share = step // GOAL, ((step % GOAL + 1) / GOAL * (step > 0)).unsqueeze(1)
-            last = self._goals[self._rows, goal]
-            self.control.aim(self._arms, last + share * (self._goals[self._rows, goal + 1] - last))
+            self.control.aim(self._arms, self._arm_targets())
+
+    def _arm_targets(self) -> Tensor:
+        """Return the targets of the left and the right arm in the next control step, (N, 14) [rad]."""
+        step = self.episode_length_buf.clamp(max=POINTS * SLOT - 1)
+        goal, share = step // GOAL, ((step % GOAL + 1) / GOAL * (step > 0)).unsqueeze(1)  # still at the first step
+        last = self._goals[self._rows, goal]
+        return last + share * (self._goals[self._rows, goal + 1] - last)
 
     def apply_control(self) -> None:
         super().apply_control()
@@ -204,6 +209,10 @@ class LeagueTask(LeggedRobot):
         self.missed[self._rows, slot] = torch.where(walks.unsqueeze(1), missed, self.missed[self._rows, slot])
         ahead, aside = torch.cos(yaw), torch.sin(yaw)
         asked = [ahead * way[:, 0] + aside * way[:, 1], ahead * way[:, 1] - aside * way[:, 0], turn]
-        stays = self._reached[:, [0, 0, 1]]
+        stays = torch.cat([self._reached[:, :1], self._reached], dim=1)  # of vx, vy, yaw rate
         commands = torch.where(stays, 0.0, GAIN * torch.stack(asked, dim=1))
         self.command_sampler.hold(commands.clamp(self._limits[:, 0], self._limits[:, 1]))
+        self.base_sampler.hold()
+        if self.course.stage != "own":  # a policy may observe the targets of held joints
+            targets = self._arm_targets() - self.default_dof_pos[self._arms]
+            self.control.held_offsets.index_copy_(1, self._held, targets.index_select(1, self._of_held))

@@ -109,12 +109,26 @@ def test_arms_stay_where_they_were_at_the_start_while_they_are_held(robot):
         assert task.control._target[1, 15:22].numpy() == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_task_without_actions_for_the_arms_is_measured_too(robot):
-    task = league_task(robot, "walking", **{"control.held": list(HELD), "train.algorithm.symmetry": False})
+def test_a_policy_that_does_not_move_the_arms_may_observe_their_targets(robot):
+    groups = {"actor": {"terms": ["dof_pos", "held_targets"]}}
+    changes = {"control.held": list(HELD), "control.actuator.delay": [0, 3], "observations.groups": groups}
+    task = league_task(robot, "walking", **changes)
     assert task.num_actions == 15
+    assert task.control.actuator is None  # motors are ideal
     at(task, 25)
+    task.ask()
     task.set_controls()
-    assert float(task.control._target[0, 15]) == pytest.approx(0.1525, abs=5e-5)
+    expected = [0.1525, 0.2293, 0.1700, 0.7370, -0.1044, -0.3497, 0.2206]
+    assert task.control._target[0, 15:22].numpy() == pytest.approx(expected, abs=5e-5)
+    assert task._obs_held_targets()[0, :7].numpy() == pytest.approx(expected - robot.default_dof_pos[15:22], abs=5e-5)
+    task.step(zeros(task))
+    assert not league_task(robot, "own", **changes)._obs_held_targets().any()
+
+
+def test_height_and_pitch_are_the_usual_ones(robot):
+    ranges = {"commands.ranges.base_height": [0.5, 0.7], "commands.ranges.base_pitch": [0.1, 0.3]}
+    task = league_task(robot, "own", **ranges, **{"rewards.base_height_target": 0.66})
+    assert task.base_commands.tolist() == [pytest.approx([0.66, 0.0])] * 2
 
 
 def test_punches_last_four_control_steps(robot):

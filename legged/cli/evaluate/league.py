@@ -18,7 +18,7 @@ RUNS = 64
 
 @sub_command(
     "legged evaluate league g1_flat",
-    "legged evaluate league policy.onnx --layout holosoma --stages held,punches --runs 10",
+    "legged evaluate league logs/ppo_g1_29dof.onnx --layout holosoma --stages held,punches --runs 10",
     arguments=(
         *EVALUATED,
         argument("--runs", type=int, default=RUNS, help=f"number of runs of each stage; {RUNS} by default"),
