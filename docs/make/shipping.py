@@ -23,7 +23,7 @@ FEW = 4096
 """Parameters with at most this many numbers keep float32."""
 ACTOR = ("actor_state_dict", "iter", "infos")
 BOTH = (*ACTOR, "critic_state_dict")
-MEASURED = (MOTORS, TIMING_FILE, "evaluation_*", "stress_*", "crossing.*", "time_to_walk.json")
+MEASURED = (MOTORS, TIMING_FILE, "evaluation_*", "stress_*", "league_*", "crossing.*", "time_to_walk.json")
 """Files that describe one policy, and would be wrong next to another one."""
 PICTURES = ("*.png", "*.gif", "*.mp4")
 
@@ -86,17 +86,18 @@ def _small(checkpoint: Path) -> memoryview:
 
 
 def _measured(run: Record) -> list[str]:
-    """Return the names of the files with the times, the evaluations and the stress tests of a run's last policy.
+    """Return the names of the files with the times, the evaluations, the stress tests and the league's runs of a run's last
+    policy.
 
     Raises:
-        ConfigError: a stress test is damaged.
+        ConfigError: a stress test or a file of the league is damaged.
     """
     names = [TIMING_FILE, *map(file_name, run.results)]
-    for path in sorted(run.folder.glob(stress_name("*"))):
+    for path in sorted([*run.folder.glob(stress_name("*")), *run.folder.glob("league_*.json")]):
         try:
             other = run.another_policy(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, AttributeError) as error:
-            raise ConfigError(f"{relative(path)}: is not the result of a stress test ({error})") from error
+            raise ConfigError(f"{relative(path)}: is not the result of an evaluation ({error})") from error
         names += [] if other else [path.name]
     return names
 

@@ -26,7 +26,7 @@ from legged.process.paths import relative
 ROOT = Path(__file__).resolve().parents[2]
 MARKED = re.compile(r"(<!-- table: ([^\n]*?) -->\n)(.*?)(<!-- end -->|(?=<!-- table:)|\Z)", re.DOTALL)
 WARP, C = "mujoco_warp", "mujoco"
-STRESS = f"stress_{C}"
+STRESS, LEAGUE = f"stress_{C}", f"league_{C}"
 NEW_GROUND = ("dense_blocks", "kerbs", "rubble")
 FLAT = ("anymal_c", "anymal_b", "anymal_d", "spot", "go1", "go2", "go2w", "a1", "g1", "h1", "cassie")
 TOLD_LESS = ("blind", "proprio", "estimator", "student", "student_ppo")
@@ -191,9 +191,10 @@ def results(policies: Path) -> str:
     """Return the short table of README.md."""
 
     def quality(task: str) -> str:
-        if task == "half_cheetah":
-            returns = read(policies / task, "evaluation_gymnasium")["episodes"]["return"]
-            return f"return {returns['mean']:.0f} in Gymnasium's HalfCheetah-v5"
+        if (policies / task / f"{LEAGUE}.json").exists():
+            run = read(policies / task, LEAGUE)["stages"]["punches"]
+            ended = f"{percent(run['completed'])} % to the end"
+            return f"{run['survival_s']:.1f} of 90 s in the [G1 league](docs/league.md), {ended}"
         result = evaluation(policies / task)
         velocity, _, falls = errors(result)
         text = f"velocity RMSE {velocity.partition(' ')[0]} m/s, {falls} % fall"
@@ -210,7 +211,7 @@ def results(policies: Path) -> str:
         beside = f", sharing the GPU with {others} other training{'s' * (others != '1')}" if others != "0" else ""
         return f"{gpu}, {said}: {wall.partition(' ')[0]} s{beside}"
 
-    tasks = ("anymal_c_flat", "anymal_c", "g1_flat", "go2_real", "go2w", "half_cheetah")
+    tasks = ("anymal_c_flat", "anymal_c", "g1_flat", "g1_teleop", "go2_real", "go2w")
     rows = [[f"`{task}`", descriptions()[task], effort(task), quality(task)] for task in tasks]
     return table(("task", "what it learns", "training", "quality in C MuJoCo"), rows)
 

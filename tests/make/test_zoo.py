@@ -321,7 +321,7 @@ def test_stress_tests_of_the_policy_are_shipped_with_it():
     ship([run], Path("shipped"))
     assert [path.name for path in (Path("shipped") / TASK).glob("stress_*")] == ["stress_mujoco.json"]
     (run.folder / "stress_mujoco.json").write_text("[1]")
-    with pytest.raises(ConfigError, match=r"stress_mujoco\.json: is not the result of a stress test"):
+    with pytest.raises(ConfigError, match=r"stress_mujoco\.json: is not the result of an evaluation"):
         ship([run], Path("shipped"))
     assert (Path("shipped") / TASK / "stress_mujoco.json").exists()  # the old one is there as it was
 
