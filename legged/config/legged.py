@@ -56,8 +56,8 @@ class CommandCurriculumConfig:
 
 @dataclass(frozen=True)
 class WaypointsConfig:
-    """Waypoints: places and headings to which some robots walk. New waypoints come with the times of new commands. Velocity
-    commands are proportional to the error in the yaw frame, and within the ranges of the commands.
+    """Waypoints: places and headings to which some robots walk. A robot gets a new waypoint whenever it gets a new command.
+    Velocity commands are proportional to the error in the yaw frame, and within the ranges of the commands.
     """
 
     share: float = field(default=0.0, metadata=UNIT)

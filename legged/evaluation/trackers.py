@@ -11,7 +11,7 @@ from legged.config.tracking import tracks_motions
 from legged.deploy.policy import listed, open_onnx
 from legged.envs.motion_tracking import MotionTracking
 from legged.errors import ConfigError, suggest
-from legged.evaluation.measurement import Overflows
+from legged.evaluation.measurement import Overflows, warn_of_overflows
 from legged.evaluation.motions import ENDLESS_S, measure_motion, on_the_motion
 from legged.policies.foreign import DAMPING, JOINTS, STIFFNESS, Layout
 from legged.policies.restore import nominal, undisturbed
@@ -90,7 +90,10 @@ class Tracker:
 
     def measure(self) -> dict[str, Any]:
         """Let the robots track the motion, from random frames and from the first one (`measure_motion`)."""
-        return {"file": str(self._path), **measure_motion(self.task, self._act, Overflows())}
+        overflows = Overflows()
+        found = {"file": str(self._path), **measure_motion(self.task, self._act, overflows)}
+        warn_of_overflows("trackers", overflows.total(self.task))
+        return found
 
     def _act(self, _: Any) -> Tensor:
         """Return the network's actions (N, A) for the robots' states. Files take one observation at a time.

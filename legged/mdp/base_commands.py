@@ -28,7 +28,7 @@ class BaseCommands:
             self._drawn, self.STATE = numbers.between(low, high, 2), ("commands",)
 
     def update(self, velocity: Commands) -> None:
-        """Give new commands to the robots whose command of a velocity is new."""
+        """Give new commands to the robots that got a new velocity command."""
         if self._drawn is not None:
             masked_set_(self.commands, velocity.renewed, self._drawn.values)
 

@@ -54,6 +54,8 @@ class Commands:
         """(N,) True for robots whose yaw rate steers towards their heading, in heading mode."""
         self.standing = torch.zeros(num_envs, dtype=torch.bool, device=device)
         """(N,) True for robots whose command is to stand still. They do not turn, even in heading mode."""
+        self.renewed = torch.zeros_like(self.standing)
+        """(N,) True for robots that got a new command in the last `update`."""
         self._sample = torch.zeros(num_envs, 4, device=device)
         self._sample_standing = torch.zeros_like(self.standing)
         self.numbers = numbers or RandomPool(num_envs, device)
@@ -86,10 +88,10 @@ class Commands:
             self._update_in_one_launch(reset, base_quat)
             return
         self.time_left.sub_(self.dt)
-        due = (reset | (self.time_left <= 0.5 * self.dt)) > self.held  # for masks, a > b means a and not b
-        masked_set_(self.commands, due, self._sample)
-        masked_set_(self.standing, due, self._sample_standing)
-        masked_set_(self.time_left, due, self.cfg.resampling_time_s)
+        torch.gt(reset | (self.time_left <= 0.5 * self.dt), self.held, out=self.renewed)  # for masks: a and not b
+        masked_set_(self.commands, self.renewed, self._sample)
+        masked_set_(self.standing, self.renewed, self._sample_standing)
+        masked_set_(self.time_left, self.renewed, self.cfg.resampling_time_s)
         if self.cfg.heading_command:
             low, high = self.ranges[2]
             error = wrap_to_pi(self.commands[:, 3] - yaw_of(base_quat))
@@ -103,13 +105,8 @@ class Commands:
         drawn = (self._sample, self._sample_standing)
         times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
         steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, self.ranges)
-        written = (self.commands, self.standing, self.time_left, self.is_moving)
+        written = (self.commands, self.standing, self.time_left, self.is_moving, self.renewed)
         self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
-
-    @property
-    def renewed(self) -> Tensor:
-        """(N,) True for robots that got a new command in the last `update`."""
-        return self.time_left > self.cfg.resampling_time_s - 0.5 * self.dt
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Set fixed commands, (N, 3) or one (3,) for all robots. They are not sampled any more. With `heading` (N,) [rad] and

@@ -1,4 +1,4 @@
-"""Disturbances: kicks of the base and forces on bodies, at random intervals for each robot, and moving held joints."""
+"""Disturbances: kicks of the base and forces on bodies, at random intervals for each robot, and goals of held joints."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING

@@ -139,6 +139,8 @@ def _layout_of(contract: Contract) -> Layout:
         raise ConfigError(f"{path}: the policy has a memory or a history; only policies with neither can be played here")
     observation: dict[str, float] = {}
     for term in contract.terms:
+        if term.joints is not None and len(term.joints) < len(contract.joint_names):
+            raise ConfigError(f"{path}: observation: '{term.name}' shows only some joints; evaluate the run instead")
         halves = dict(zip(COMMANDS, (term.scale[:2], term.scale[2:]), strict=True))
         for part, scales in halves.items() if term.name == "commands" else ((term.name, term.scale),):
             if (scales != scales[0]).any():

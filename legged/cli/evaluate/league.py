@@ -9,6 +9,7 @@ from legged.deploy.command_parser import argument, check_number
 from legged.errors import ConfigError, suggest
 from legged.evaluation.league.measuring import MOST_RUNS, evaluate_foreign, evaluate_league
 from legged.evaluation.league.task import STAGES
+from legged.evaluation.result_file import CHANGED, changes_of
 from legged.policies.foreign import read_layout
 from legged.process.paths import ready_to_write
 
@@ -53,6 +54,7 @@ def league(args: argparse.Namespace) -> int:
     layout = read_layout(args.layout or str(description_of(file, file)), "--layout")
     if layout.task:
         raise ConfigError(f"POLICY: {file} tracks a motion; the league measures policies that follow velocity commands")
-    folder = args.out or file.parent
+    overrides, device = policy_overrides(args), measuring_device(args)
+    folder = args.out or (file.parent / CHANGED if changes_of(overrides) else file.parent)
     ready_to_write(folder)
-    return evaluate_foreign(file, layout, runs, stages, measuring_device(args), policy_overrides(args), folder)
+    return evaluate_foreign(file, layout, runs, stages, device, not args.no_graph, overrides, folder)

@@ -22,7 +22,7 @@ from legged.evaluation.league.protocol import ARM_JOINTS, CONTROL_DT, POINTS, RU
 from legged.evaluation.league.robot import OURS, servo_gains, write_robot
 from legged.evaluation.league.task import SLOT, STAGES, Course, LeagueTask, make_league
 from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
-from legged.evaluation.result_file import device_name, write_result
+from legged.evaluation.result_file import changes_of, device_name, write_result
 from legged.mdp.control import control_gains
 from legged.physics import engine_name, resolve_physics
 from legged.policies.foreign import ForeignPolicy, Layout
@@ -38,6 +38,11 @@ TASK = "g1_flat"
 """Task in which ONNX policies run. Only its robot matters for them."""
 SOLVER = {"dt": 0.002, "impratio": 1.0, "iterations": 100, "ls_iterations": 50, "nconmax": 64, "njmax": 320}
 """Settings of the section `sim`: MuJoCo's defaults, and memory for a robot that lies on the ground."""
+FIXED = (
+    *("control.", "commands.", "domain_rand.", "terrain.", "rewards.scales", "robot", "sim.self_collisions"),
+    *("env.num_envs", "env.episode_length_s", *(f"sim.{name}" for name in SOLVER)),
+)
+"""Beginnings of the settings that the league's rules set."""
 AT_ONCE_S = 1.0
 """Simulated time after which the runs are asked whether all have ended [s]."""
 Act = Callable[[LeagueTask, TensorDict], Tensor]
@@ -117,14 +122,18 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
     league_<physics>.json, and return the exit code.
 
     Raises:
-        ConfigError: the policy's robot is not the G1 of this package.
+        ConfigError: the policy's robot is not the G1 of this package, its joints have another law than P, or an override is
+            one of the league's rules.
         RunError: the file can't be written.
     """
     start, cfg = time.perf_counter(), setting.cfg
+    _check_overrides(setting.asked)
     own = load_robot(cfg.robot)
     if own.folder != load_robot(OURS).folder:
         raise ConfigError(f"POLICY: the league's robot is '{OURS}', but '{setting.policy.cfg.task}' has '{own.name}'")
     assert follows_velocities(setting.policy.cfg)
+    if cfg.control.laws != {"P"}:
+        raise ConfigError("POLICY: the league moves the arms by their angles, so all joints need control.control_type P")
     policy, ranges = replace(setting.policy, cfg=with_ideal_motors(setting.policy.cfg)), cfg.commands.ranges
     limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
 
@@ -147,6 +156,7 @@ def evaluate_foreign(
     runs: Sequence[int],
     stages: Sequence[str],
     device: torch.device,
+    graph: bool,
     overrides: Sequence[tuple[str, Any]],
     folder: Path,
 ) -> int:
@@ -154,10 +164,12 @@ def evaluate_foreign(
     the policy's contract, or from -1 to 1 without a contract. The file league_<physics>.json goes to `folder`.
 
     Raises:
-        ConfigError: the policy or its layout does not fit the robot, or its control step is not the league's.
+        ConfigError: the policy or its layout does not fit the robot, its control step is not the league's, or an override is
+            one of the league's rules.
         RunError: the file can't be written.
     """
     start = time.perf_counter()
+    _check_overrides(overrides)
     cfg = task_config(TASK, [("sim.physics", resolve_physics("auto", device)), *overrides])
     assert follows_velocities(cfg)
     if abs(layout.control_dt - CONTROL_DT) > 1e-9:
@@ -170,14 +182,21 @@ def evaluate_foreign(
         targets = [("control.action_scale", 1.0), ("control.clip_actions", 1000.0)]
         changes = nominal(cfg, [*rules(cfg, len(runs), robot, gains), *targets])
         foreign.reset(len(runs))
-        task = make_league(Course.of(stage, runs, robot, limits), changes, device, True, None)
+        task = make_league(Course.of(stage, runs, robot, limits), changes, device, graph, None)
         return task, partial(_act, foreign)
 
     found = measure_stages(build, stages)
     engine = engine_name(cfg.sim, device)
-    head = {"file": str(file), "physics": engine, "device": device_name(device), "wall_s": time.perf_counter() - start}
+    head = {"file": str(file), "physics": engine, "device": device_name(device), **changes_of(overrides)}
+    head["wall_s"] = time.perf_counter() - start
     report({**head, **found}, list(runs), folder / f"league_{engine}.json")
     return 0
+
+
+def _check_overrides(overrides: Sequence[tuple[str, Any]]) -> None:
+    for path, _ in overrides:
+        if path.startswith(FIXED):
+            raise ConfigError(f"{path}: cannot be changed, because the league's rules set it")
 
 
 def _act(foreign: ForeignPolicy, task: LeagueTask, _: TensorDict) -> Tensor:

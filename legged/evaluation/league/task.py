@@ -14,12 +14,13 @@ from torch.nn.functional import normalize
 from legged.envs import LeggedRobot
 from legged.evaluation.league import protocol
 from legged.evaluation.league.protocol import CONTROL_DT, GOAL_S, POINT_S, POINTS
-from legged.math import quat_multiply, quat_rotate, wrap_to_pi, yaw_of
+from legged.math import quat_multiply, quat_rotate, yaw_of
+from legged.mdp.waypoints import approach
 from legged.registry import task_class
 from legged.robots.robot import Robot
 
 STAGES = {
-    "own": "the policy moves the arms as in its training",
+    "own": "the arms are as in the training",
     "held": "the arms are held at their angles of the start",
     "walking": "the arms move",
     "punches": "the arms move, and punches hit the robot",
@@ -200,17 +201,12 @@ class LeagueTask(LeggedRobot):
     def ask(self) -> None:
         super().ask()
         slot, step = self._slot(), self.episode_length_buf % SLOT
-        point, yaw = self._points[self._rows, slot], yaw_of(self.base_quat)
-        way, turn = point[:, :2] - self.base_pos[:, :2], wrap_to_pi(point[:, 2] - yaw)
-        missed = torch.stack([way.norm(dim=1), turn.abs()], dim=1)
-        kept = self._reached & (step > 0).unsqueeze(1)
-        self._reached.copy_(torch.where(kept, missed <= self._far, missed < self._near))
+        self.alive.logical_and_(~self.reset_buf | (self.lasted == 0))  # a reset ends the run of a state that diverged
+        pose = torch.cat([self.base_pos[:, :2], yaw_of(self.base_quat).unsqueeze(1)], dim=1)
+        point = self._points[self._rows, slot]
+        commands, missed = approach(point, pose, self._reached, step > 0, self._near, self._far, GAIN)
         walks = self.alive & (self.episode_length_buf < POINTS * SLOT)
         self.missed[self._rows, slot] = torch.where(walks.unsqueeze(1), missed, self.missed[self._rows, slot])
-        ahead, aside = torch.cos(yaw), torch.sin(yaw)
-        asked = [ahead * way[:, 0] + aside * way[:, 1], ahead * way[:, 1] - aside * way[:, 0], turn]
-        stays = torch.cat([self._reached[:, :1], self._reached], dim=1)  # of vx, vy, yaw rate
-        commands = torch.where(stays, 0.0, GAIN * torch.stack(asked, dim=1))
         self.command_sampler.hold(commands.clamp(self._limits[:, 0], self._limits[:, 1]))
         self.base_sampler.hold()
         if self.course.stage != "own":  # a policy may observe the targets of held joints

@@ -94,11 +94,14 @@ def renew_commands(
     standing: wp.array[wp.bool],
     time_left: wp.array[float],
     is_moving: wp.array[wp.bool],
+    renewed: wp.array[wp.bool],
 ):
     """Resample commands, and steer towards headings unless `heading_gain` is 0. One thread per robot."""
     robot = wp.tid()
     left = time_left[robot] - dt
-    if (reset[robot] or left <= last_moment) and not held[robot]:
+    due = (reset[robot] or left <= last_moment) and not held[robot]
+    renewed[robot] = due
+    if due:
         for i in range(4):
             commands[robot, i] = sample[robot, i]
         standing[robot] = sample_standing[robot]

@@ -250,6 +250,8 @@ def test_an_onnx_policy_is_measured_on_the_command_line(capsys):
         (["g1_flat", "--runs", "0"], "--runs"),
         (["g1_flat", "--layout", "holosoma"], "--layout: has no effect on a policy that is not an ONNX file"),
         (["go1_flat"], "POLICY: the league's robot is 'g1', but 'go1_flat' has 'go1'"),
+        (["g1_flat", "control.decimation=4"], "control.decimation: cannot be changed, because the league's rules set it"),
+        (["g1_flat", "domain_rand.forces.pull.x=[1,2]"], "domain_rand.forces.pull.x: cannot be changed"),
         (["none.onnx"], "there is no ONNX file"),
     ],
 )
