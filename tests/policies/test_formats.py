@@ -129,7 +129,7 @@ class UnitreeReader(Reader):
 
 
 def measured_in(task, robot, command):
-    """What a robot of the task measures, from the engine's own state."""
+    """The sensors of one robot of a task, computed from the state of its physics engine."""
     qpos, qvel = (tensor[robot].double().numpy() for tensor in (task.physics._qpos, task.physics._qvel))
     w, x, y, z = qpos[3:7]
     return {
