@@ -81,13 +81,13 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         self.base_sampler.update(self.command_sampler)
 
     @torch.no_grad()
-    def hold_commands(self, commands: Tensor, heading: Tensor | None = None) -> TensorDict:
+    def hold_commands(self, commands: Tensor, heading: Tensor | None = None, base: Tensor | None = None) -> TensorDict:
         """Hold `commands` (N, 3) or (3,): vx, vy [m/s] and yaw rate [rad/s], until the next call. Return the observations.
-        If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead. The base has
-        its usual height and no pitch.
+        If `heading` (N,) [rad] is given and heading mode is on, the yaw rate steers towards the heading instead. `base`,
+        (N, 2) or (2,), are height [m] and pitch [rad] of the base, by default the usual height and no pitch.
         """
         self.command_sampler.hold(commands, heading)
-        self.base_sampler.hold()
+        self.base_sampler.hold(base)
         self.observation_terms.evaluate(self.episode_length_buf == 0, again=True)
         for group in self.observation_groups.values():
             group.compute()

@@ -49,7 +49,7 @@ def evaluate_following(
     if grid is not None:
         task, act = ready_to_track(setting, grid)
         tracking = measure_tracking(task, act, grid)
-        if setting.policy.cfg.terrain.mesh_type != "plane":  # type: ignore[attr-defined]
+        if setting.cfg.terrain.mesh_type != "plane":
             tracking = {"rough": {"bumps": BUMPS * task.cfg.terrain.scale, **tracking}}
         del task, act  # a GPU may not have the memory for two tasks
     success = success_over_difficulty(setting, sizes, robots) if sizes else None

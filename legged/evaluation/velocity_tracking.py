@@ -29,8 +29,12 @@ from legged.tables import screen_table
 from legged.terrain import Terrain
 
 GRAVITY = 9.81
+GOLDEN = 0.6180339887498949
+"""Golden ratio minus 1: its multiples, taken modulo 1, are spread evenly."""
 SLOWEST = 0.1
 """Smallest mean speed for which a cost of transport is computed [m/s]."""
+BASE = {"height": "m", "pitch": "rad"}
+"""Commands of the base besides its velocity, and their units."""
 GAIT = (
     ("duty factor", "duty_factor", 1.0, "{:.2f}"),
     ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
@@ -46,7 +50,7 @@ def ready_to_track(setting: Setting, grid: Grid) -> tuple[LeggedRobot, Actor]:
     """Build a task with grid.num_envs robots, and the policy. If the task has terrain, the robots stand on level ground with
     bumps, otherwise on a plane.
     """
-    changes, terrain = place_to_track(setting.policy.cfg, grid, setting.asked)  # type: ignore[arg-type]
+    changes, terrain = place_to_track(setting.cfg, grid, setting.asked)
     if terrain is not None:
         print(f"tracking on rough ground: {grid.size_text}", flush=True)
     return restore(setting.policy, changes, setting.device, setting.graph, terrain)
@@ -74,7 +78,8 @@ def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, An
     A robot is measured until its episode ends by a fall or a time-out. Errors are those at the end of each control step. The
     cost of transport uses the power in the last physics step of each control step, which is lower than the mean over all
     physics steps. `contact_overflows` counts how often a robot lost contacts in a control step, because memory was full.
-    `estimates` holds the errors of the policy's estimator, if it has one.
+    `estimates` holds the errors of the policy's estimator, if it has one. In a task that commands heights and pitches of the
+    base, the robots of a cell have different ones, and `rmse_height` [m] and `rmse_pitch` [rad] are their errors.
     """
     network = getattr(act, "network", None)
     estimated = EstimationErrors(task.observation_groups[ESTIMATED]) if isinstance(network, EstimatingModel) else None
@@ -87,7 +92,7 @@ def measure_tracking(task: LeggedRobot, act: Policy, grid: Grid) -> dict[str, An
 
     commands = torch.tensor(grid.cells, dtype=torch.float32, device=torch.device(task.device))
     commands = commands.repeat_interleave(grid.robots, dim=0)
-    sums, fell, lost = hold(task, act, commands, grid.settle_s, grid.hold_s, read)
+    sums, fell, lost = hold(task, act, commands, grid.settle_s, grid.hold_s, read, postures(task, grid))
     measured_s = (round(grid.hold_s / task.dt) - round(grid.settle_s / task.dt)) * task.dt
     found = _summary(task, grid, sums, fell, measured_s)
     if estimated is not None:
@@ -103,15 +108,17 @@ def hold(
     settle_s: float,
     hold_s: float,
     read: Callable[[TensorDict], dict[str, Tensor]],
+    base: Tensor | None = None,
 ) -> tuple[dict[str, Tensor], Tensor, int]:
-    """Let robots follow constant commands (N, 3) for `hold_s` [s]. From `settle_s` [s] on, `read` is called with the
-    observations after each control step and returns name -> quantity (N, ...).
+    """Let robots follow constant commands (N, 3) for `hold_s` [s], with the heights and pitches `base` (N, 2) of
+    `hold_commands`. From `settle_s` [s] on, `read` is called with the observations after each control step and returns name
+    -> quantity (N, ...).
 
     Return the sums of these quantities over each robot's first episode, flags (N,) of the robots that fell in this episode,
     and the number of control steps with lost contacts, summed over robots. The sum "steps" (N,) counts the summed steps.
     """
     task.reset()
-    observations = task.hold_commands(commands)
+    observations = task.hold_commands(commands, base=base)
     alive = torch.ones(task.num_envs, dtype=torch.bool, device=commands.device)
     fell, overflows = torch.zeros_like(alive), Overflows()
     sums: dict[str, Tensor] = {}
@@ -129,7 +136,7 @@ def hold(
 
 def _now(task: LeggedRobot) -> dict[str, Tensor]:
     """Return name -> quantity, (N,) or (N, feet), after a control step. `hold` sums each quantity over steps."""
-    power = task.torques * task.dof_vel
+    power, height = task.torques * task.dof_vel, task.base_pos[:, 2] - task.height_scan.ground
     collision = task.contact_forces[:, task.penalised_indices].norm(dim=2) > task.contacts.force
     return {
         "lin": velocity_error(task.commands, task.base_lin_vel),
@@ -137,11 +144,25 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
         "power": power.abs().sum(dim=1),
         "positive_power": power.clamp(min=0.0).sum(dim=1),
         "speed": task.base_lin_vel[:, :2].norm(dim=1),
-        "height": task.base_pos[:, 2] - task.height_scan.ground,
+        "height": height,
         "collision": collision.any(dim=1).float(),
         "stance": (task.contact_forces[:, task.feet_indices, 2] > task.contacts.force).float(),
         "touch_downs": task.contacts.first_contact.float(),
+        "height_error": (height - task.base_commands[:, 0]).square(),
+        "pitch_error": (task.projected_gravity[:, 0].clamp(-1.0, 1.0).asin() - task.base_commands[:, 1]).square(),
     }
+
+
+def postures(task: LeggedRobot, grid: Grid) -> Tensor | None:
+    """Return heights [m] and pitches [rad] of the bases, (N, 2), which within each cell are spread evenly over the task's
+    ranges; None if the task does not command them.
+    """
+    if task.base_sampler.ranges is None:
+        return None
+    index = np.arange(grid.robots)
+    shares = np.stack([(index + 0.5) / grid.robots, (index * GOLDEN + 0.5) % 1.0], axis=1)
+    low, high = np.array(task.base_sampler.ranges).T
+    return torch.tensor(np.tile(low + shares * (high - low), (grid.num_cells, 1)), device=task.device).float()
 
 
 def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tensor, measured_s: float) -> dict[str, Any]:
@@ -155,6 +176,7 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
     # A cell whose robots all fell before the measurement has figures of NaN, because an error of 0 would look perfect.
     steps = np.where(total["steps"] > 0, total["steps"], np.nan)
     lin, ang = (np.sqrt(total[name] / steps) for name in ("lin", "ang"))
+    base = {f"rmse_{name}": np.sqrt(total[f"{name}_error"] / steps) for name in BASE} if task.base_sampler.ranges else {}
     speed = total["speed"] / steps
     weight = task.robot.mass * GRAVITY
     moving = speed > SLOWEST
@@ -166,6 +188,7 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
     columns = {
         "rmse_lin": lin,
         "rmse_ang": ang,
+        **base,
         "falls": falls,
         **transport,
         "duty_factor": (total["stance"] / steps[:, None]).mean(axis=1),
@@ -186,6 +209,7 @@ def _summary(task: LeggedRobot, grid: Grid, sums: dict[str, Tensor], fell: Tenso
         "measured_s": measured_s,
         "rmse_lin": mean_and_worst(lin, cells),
         "rmse_ang": mean_and_worst(ang, cells),
+        **{name: mean_and_worst(errors, cells) for name, errors in base.items()},
         "falls": float(falls.mean()),
         **{name: number_or_null(float(np.nanmean(values))) if moving.any() else None for name, values in transport.items()},
         "gait": rows[reference],
@@ -213,7 +237,8 @@ def print_tracking(result: dict[str, Any]) -> None:
         title += f", on level ground with bumps of up to {100 * result['bumps']:.2g} cm"
     rows: list[list[str]] = []
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
-    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang)):
+    postures = [(f"base {name}", unit, result[f"rmse_{name}"]) for name, unit in BASE.items() if f"rmse_{name}" in result]
+    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang), *postures):
         if errors["mean"] is None:
             rows.append([f"{name} RMSE", "none", "every robot fell before it was measured"])
             continue

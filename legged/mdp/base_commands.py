@@ -1,6 +1,7 @@
 """Commands of the base's height and pitch, sampled together with velocity commands."""
 
 import torch
+from torch import Tensor
 
 from legged.config.legged import CommandRanges
 from legged.math import masked_set_
@@ -21,10 +22,12 @@ class BaseCommands:
         """(2,) height and pitch that are commanded without a range, and while velocity commands are held."""
         self.commands = self.usual.repeat(numbers.num_envs, 1)
         """(N, 2) commanded height [m] and pitch [rad], positive if the base leans forward."""
-        spans = cfg.base_height if any(cfg.base_height) else (height, height), cfg.base_pitch
+        heights = cfg.base_height if any(cfg.base_height) else (height, height)
+        self.ranges = (heights, cfg.base_pitch) if any((*cfg.base_height, *cfg.base_pitch)) else None
+        """Ranges of the height [m] and of the pitch [rad]; None if both are constant."""
         self._drawn = None
-        if any(cfg.base_height) or any(cfg.base_pitch):
-            low, high = zip(*spans, strict=True)
+        if self.ranges is not None:
+            low, high = zip(*self.ranges, strict=True)
             self._drawn, self.STATE = numbers.between(low, high, 2), ("commands",)
 
     def update(self, velocity: Commands) -> None:
@@ -32,6 +35,6 @@ class BaseCommands:
         if self._drawn is not None:
             masked_set_(self.commands, velocity.renewed, self._drawn.values)
 
-    def hold(self) -> None:
-        """Command the usual height and pitch."""
-        self.commands.copy_(self.usual)
+    def hold(self, commands: Tensor | None = None) -> None:
+        """Command the heights [m] and pitches [rad] `commands` (N, 2) or (2,), or the usual ones."""
+        self.commands.copy_(self.usual if commands is None else commands)

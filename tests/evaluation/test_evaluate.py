@@ -5,6 +5,7 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers import POLICY, TASK, call, kept_global_state, run_folders, small_config, stand, tiny_run
@@ -78,6 +79,28 @@ def test_robots_that_stand_have_the_error_of_what_they_are_asked_for():
     assert result["rmse_lin"]["mean"] == pytest.approx(0.346, abs=0.03)
     assert result["gait"]["command"] == [0.5, 0.0, 0.0]
     json.dumps(result, allow_nan=False)
+
+
+@pytest.mark.slow
+def test_robots_that_stand_have_the_errors_of_the_heights_and_pitches_they_are_asked_for(capsys):
+    """Four robots of a cell have heights in the middle of four equal parts of the range, and pitches of the same kind."""
+    grid = Grid([0.0], [0.0], [0.0, 0.4], robots=4, hold_s=2.0)
+    ranges = {"base_height": [0.3, 0.7], "base_pitch": [-0.2, 0.6]}
+    result = on_grid(grid, stand, *((f"commands.ranges.{name}", values) for name, values in ranges.items()))
+    height = result["gait"]["base_height"]
+    asked = np.array([0.35, 0.45, 0.55, 0.65])
+    pitches = -0.2 + 0.8 * np.array([0.5, 0.118034, 0.736068, 0.354102])  # 0.5 + k * 0.618034, modulo 1
+    for cell in result["cells"]:
+        assert cell["rmse_height"] == pytest.approx(np.sqrt(np.mean((height - asked) ** 2)), abs=0.005)
+        assert cell["rmse_pitch"] == pytest.approx(np.sqrt(np.mean(pitches**2)), abs=0.03)
+    assert result["rmse_height"]["mean"] == pytest.approx(np.mean([cell["rmse_height"] for cell in result["cells"]]))
+    print_tracking({"task": "t", "checkpoint": "c", "physics": "mujoco", "ground": "", **result})
+    assert f"{result['rmse_pitch']['mean']:.3f} rad" in capsys.readouterr().out
+    fixed = on_grid(Grid([0.0], [0.0], [0.0], robots=1, hold_s=1.1))
+    assert "rmse_height" not in fixed
+    only_pitch = on_grid(grid, stand, ("commands.ranges.base_pitch", [0.0, 0.2]))  # the height is the usual one
+    usual = small_config().rewards.base_height_target
+    assert only_pitch["rmse_height"]["mean"] == pytest.approx(abs(height - usual), abs=0.01)
 
 
 @pytest.mark.slow

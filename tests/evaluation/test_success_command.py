@@ -282,6 +282,17 @@ def test_evaluate_measures_success_and_tracking_on_rough_ground(run, tmp_path, c
 
 
 @pytest.mark.slow
+def test_a_policy_of_rough_ground_is_measured_on_the_plane_that_is_asked_for(run, tmp_path, capsys):
+    """It was put on bumps, and nothing said so."""
+    here = ["anymal_c", *HERE, "terrain.mesh_type=plane", "--out", str(tmp_path)]
+    assert call(evaluate_grid.main, [*here, *CELL]) == 0
+    assert "on rough ground" not in capsys.readouterr().out
+    result = json.loads((tmp_path / "evaluation_mujoco.json").read_text())
+    assert "rough" not in result
+    assert len(result["cells"]) == 1
+
+
+@pytest.mark.slow
 def test_evaluate_alone_measures_both_on_the_task_s_own_grid_and_types(trained, tmp_path, monkeypatch):
     monkeypatch.chdir(trained)
     asked = []
