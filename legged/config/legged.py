@@ -35,7 +35,7 @@ class CommandRanges:
     base_height: Range = field(default=(0.0, 0.0), metadata=rescaled("m", between(0, 100)))
     """Height of the base above the ground [m]; [0, 0] for rewards.base_height_target."""
     base_pitch: Range = field(default=(0.0, 0.0), metadata=quantity("rad", between(-1.5, 1.5)))
-    """Pitch of the base, positive if it leans forward [rad]."""
+    """Pitch of the base or of commands.pitch_body, positive if it leans forward [rad]."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,9 @@ class CommandsConfig(Section):
     """Share of the sampled commands that are zero, so that the robot stands still."""
     single_axis_share: float = field(default=0.0, metadata=UNIT)
     """Share of the moving commands that use a single random axis: walking straight, walking sideways, or turning in place."""
+    pitch_body: str = ""
+    """Body whose pitch ranges.base_pitch commands, such as a torso above the joints of a waist. Without a name it is the
+    base."""
     waypoints: WaypointsConfig = WaypointsConfig()
     """Waypoints that some robots walk to."""
     curriculum: CommandCurriculumConfig = CommandCurriculumConfig()

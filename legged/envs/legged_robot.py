@@ -18,6 +18,7 @@ from legged.envs.velocity_terms import VelocityTerms
 from legged.mdp.base_commands import BaseCommands
 from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
+from legged.mdp.sensors import BodyStates, Sensor
 from legged.mdp.waypoints import Waypoints
 
 
@@ -43,6 +44,12 @@ class LeggedRobot(VelocityTerms, LeggedGymNames, RobotTask):
         cfg, kernels = self.cfg, self.kernels
         full_ranges = self.command_sampler.full_ranges
         self.command_curriculum = CommandCurriculum(cfg.commands.curriculum, full_ranges, self.dt, kernels)
+
+    def make_sensors(self) -> dict[str, Sensor]:
+        """Return the sensors of every robot task, and `pitch_body` if commands.pitch_body names a body."""
+        name, where = self.cfg.commands.pitch_body, self.cfg.origins.where("commands.pitch_body")
+        bodies = {"pitch_body": BodyStates(self.physics, [name], self.kernels, where)} if name else {}
+        return {**super().make_sensors(), **bodies}
 
     def make_commands(self) -> None:
         sampler = Commands(self.cfg.commands, self.num_envs, self.dt, self.device, self.kernels, self.numbers)

@@ -9,7 +9,9 @@ from torch import Tensor
 from legged.config.legged import LeggedConfig
 from legged.envs.marks import concurrent, unit
 from legged.envs.robot_terms import RobotTerms
+from legged.math import quat_rotate_inverse
 from legged.mdp.mirror_images import MirrorKind
+from legged.mdp.sensors import BodyStates
 from legged.mdp.tracking_error import velocity_error, yaw_rate_error
 
 
@@ -28,6 +30,16 @@ class VelocityTerms(RobotTerms):
     base_commands: Tensor
     """(N, 2) commanded height of the base above the ground [m] and pitch [rad], positive if it leans forward."""
 
+    @property
+    def pitch_gravity(self) -> Tensor:
+        """(N, 3) direction of gravity in the frame of the body whose pitch is commanded, the base or commands.pitch_body."""
+        body = self.sensors.get("pitch_body")
+        if not isinstance(body, BodyStates):
+            return self.projected_gravity
+        down = torch.zeros_like(body.pos[:, 0])
+        down[:, 2] = -1.0
+        return quat_rotate_inverse(body.quat[:, 0], down)
+
     # ---- observations: (N, width) each; docstrings and units go into policy.json -----------------------------------------
 
     @unit("m/s, m/s, rad/s")
@@ -37,7 +49,9 @@ class VelocityTerms(RobotTerms):
 
     @unit("m, rad")
     def _obs_base_commands(self) -> Tensor:
-        """Commanded height of the base above the ground, and pitch, positive if it leans forward [m, rad]."""
+        """Commanded height of the base above the ground, and pitch of the base or of commands.pitch_body, positive if that
+        body leans forward [m, rad].
+        """
         return self.base_commands
 
     # ---- rewards: (N,) each, before the multiplication by scale and control step ---------------------------------------
@@ -68,11 +82,11 @@ class VelocityTerms(RobotTerms):
     @concurrent
     @unit("1")
     def _reward_tilt_error(self) -> Tensor:
-        """Leaning otherwise than commanded: sum of the squared differences between x and y of `projected_gravity` and those
-        of a base with the commanded pitch and no roll. It takes the place of `orientation` under commands of the pitch.
+        """Leaning otherwise than commanded: sum of the squared differences between x and y of `pitch_gravity` and those of a
+        body with the commanded pitch and no roll. It takes the place of `orientation` under commands of the pitch.
         """
-        forward = self.projected_gravity[:, 0] - self.base_commands[:, 1].sin()
-        return forward.square() + self.projected_gravity[:, 1].square()
+        gravity = self.pitch_gravity
+        return (gravity[:, 0] - self.base_commands[:, 1].sin()).square() + gravity[:, 1].square()
 
     @concurrent
     @unit("s")

@@ -149,7 +149,7 @@ def _now(task: LeggedRobot) -> dict[str, Tensor]:
         "stance": (task.contact_forces[:, task.feet_indices, 2] > task.contacts.force).float(),
         "touch_downs": task.contacts.first_contact.float(),
         "height_error": (height - task.base_commands[:, 0]).square(),
-        "pitch_error": (task.projected_gravity[:, 0].clamp(-1.0, 1.0).asin() - task.base_commands[:, 1]).square(),
+        "pitch_error": (task.pitch_gravity[:, 0].clamp(-1.0, 1.0).asin() - task.base_commands[:, 1]).square(),
     }
 
 

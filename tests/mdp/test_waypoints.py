@@ -6,11 +6,13 @@ import pytest
 import torch
 from helpers import small_task
 
+from legged import make_task
 from legged.config.legged import CommandRanges, CommandsConfig, WaypointsConfig
 from legged.errors import ConfigError
 from legged.mdp.commands import Commands
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.waypoints import Waypoints
+from legged.registry import task_config
 
 CPU, DT = torch.device("cpu"), 0.02
 RANGES = CommandRanges(lin_vel_x=(-0.5, 0.5), lin_vel_y=(-0.4, 0.4), ang_vel_yaw=(-1.0, 1.0))
@@ -144,6 +146,29 @@ def test_gravity_in_a_base_that_leans_forward_points_forward():
     task.physics.write(torch.ones(1, dtype=torch.bool), qpos, torch.zeros_like(task.physics.qvel))
     task.sense()
     assert task.projected_gravity[0].tolist() == pytest.approx([math.sin(0.1), 0.0, -math.cos(0.1)], abs=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
+def test_the_pitch_of_a_torso_is_that_of_the_base_and_of_the_waist(engine):
+    """The base leans forward by 0.1 rad and the joint of the waist by 0.3 rad, so the torso leans by 0.4 rad."""
+    task = make_task(
+        task_config("g1_posture", [("sim.physics", engine), ("env.num_envs", 1), ("rewards.scales.tilt_error", -1.0)])
+    )
+    qpos = task.physics.qpos.clone()
+    qpos[:, 3:] = 0.0
+    qpos[:, 3:7] = torch.tensor([math.cos(0.05), 0.0, math.sin(0.05), 0.0])
+    qpos[:, 7 + task.robot.joint_names.index("waist_pitch_joint")] = 0.3
+    task.physics.write(torch.ones(1, dtype=torch.bool), qpos, torch.zeros_like(task.physics.qvel))
+    task.sense()
+    assert task.pitch_gravity[0].tolist() == pytest.approx([math.sin(0.4), 0.0, -math.cos(0.4)], abs=1e-5)
+    assert task.projected_gravity[0, 0] == pytest.approx(math.sin(0.1), abs=1e-6)
+    task.base_commands[:] = torch.tensor([0.7, 0.25])
+    assert float(task._reward_tilt_error()) == pytest.approx((math.sin(0.4) - math.sin(0.25)) ** 2, abs=1e-5)
+
+
+def test_a_body_that_the_robot_lacks_is_refused():
+    with pytest.raises(ConfigError, match=r"commands\.pitch_body: there is no body 'bass'; did you mean 'base'\? \(bodies: "):
+        small_task(("commands.pitch_body", "bass"))
 
 
 def test_without_ranges_the_usual_height_is_commanded_and_no_numbers_are_drawn():
