@@ -24,6 +24,7 @@ SENSORS = {
     "base_ang_vel": "gyro",
     "projected_gravity": "quaternion",
     "commands": "command",
+    "base_commands": "command",
     "dof_pos": "joint positions",
     "dof_vel": "joint velocities",
     "actions": "memory",
@@ -38,7 +39,7 @@ TOLERANCE = 1e-3
 """Largest difference at which limits count as equal: absolute for joint angles [rad], relative for torques and speeds."""
 DEEPEST, MOST_DIGITS = 20, 18
 """Deepest nesting, and largest number of digits of a whole number, in JSON from files and packets."""
-COMMANDS = ("vx", "vy", "yaw_rate")
+COMMANDS, BASE_COMMANDS = ("vx", "vy", "yaw_rate"), ("height", "pitch")
 NO_COMMANDS = {"command_ranges": dict.fromkeys(COMMANDS, (0.0, 0.0)), "command_dead_zone": 0.0}
 """Entries that policy.json lacks if the policy tracks motions."""
 RULES: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
@@ -155,6 +156,9 @@ class Contract:
     """(3, 2) lowest and highest vx, vy [m/s] and yaw rate [rad/s]."""
     dead_zone: float
     """Smallest horizontal speed that was commanded in training, apart from zero [m/s]."""
+    base_commands: np.ndarray
+    """(2, 3) lowest, usual and highest command of the base's height [m] and pitch [rad]; zeros for a policy that does not
+    observe these commands."""
     control_dt: float
     """Time for which an action is held [s]."""
     sim_dt: float
@@ -348,6 +352,11 @@ def contract_of(path: Path, entries: Mapping[str, Any]) -> Contract:
     ranges = np.array([said["command_ranges"][name] for name in COMMANDS], dtype=float).reshape(3, 2)
     right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
     check("command_ranges", "finite, and not above the upper limits", right, ranges[:, 0])
+    base = np.array([said.get("base_commands", {}).get(name, (0.0,) * 3) for name in BASE_COMMANDS], dtype=float).reshape(
+        2, 3
+    )
+    right = np.isfinite(base).all(axis=1) & (np.diff(base) >= 0.0).all(axis=1)
+    check("base_commands", "finite, and sorted: lowest, usual, highest", right, base[:, 1])
     control_dt, sim_dt = numbers("control_dt"), np.array(said.get("sim_dt", said["control_dt"]), dtype=float)
     check("sim_dt", "above 0, and at most control_dt", (sim_dt > 0.0) & (sim_dt <= control_dt + 1e-9), sim_dt)
     return Contract(
@@ -371,6 +380,7 @@ def contract_of(path: Path, entries: Mapping[str, Any]) -> Contract:
         groups=tuple(_groups(f"{path}: observation", said)),
         command_ranges=ranges,
         dead_zone=float(numbers("command_dead_zone")),
+        base_commands=base,
         control_dt=float(control_dt),
         sim_dt=float(sim_dt),
         actuator=dict(said.get("actuator", {})),
@@ -383,7 +393,7 @@ def _groups(where: str, said: Mapping[str, Any]) -> Iterator[Group]:
     """Yield the groups of terms. Refuse terms that do not fit the robot's joints, and gaps between columns."""
     joints = list(said["joint_names"])
     sizes = {"base_ang_vel": 3, "projected_gravity": 3, "commands": 3, "dof_pos": len(joints), "dof_vel": len(joints)}
-    sizes["actions"] = len(said["action_joints"])
+    sizes |= {"actions": len(said["action_joints"]), "base_commands": len(BASE_COMMANDS)}
     names = [entry["name"] for entry in said["observation_groups"]]
     for entry in said["observation"]:
         if entry["group"] not in names:

@@ -57,8 +57,8 @@ TRANSITIONS = {
 """State -> its allowed events. Each event leads to the state with the same name. `Event.QUIT` is allowed in all states."""
 MOVING = (State.STAND, State.WALK)
 """States in which the safety checks can stop the robot."""
-RAMP = np.array([1.0, 1.0, 2.0])
-"""Largest rate of change of the commanded vx, vy [m/s^2] and yaw rate [rad/s^2]."""
+RAMP, BASE_RAMP = np.array([1.0, 1.0, 2.0]), np.array([0.2, 0.5])
+"""Largest rates of change: of the commanded vx, vy [m/s^2] and yaw rate [rad/s^2], and of height [m/s] and pitch [rad/s]."""
 KEYS = {
     "0": Event.IDLE,
     "1": Event.DAMPING,
@@ -107,6 +107,8 @@ class Orders:
     """True if `velocity` holds shares of the policy's command ranges: -1 is the lowest command, and 1 the highest."""
     lost: str | None = None
     """Reason why the operator can no longer be reached; None while the operator is connected."""
+    base: np.ndarray | None = None
+    """(2,) commanded height [m] and pitch [rad] of the base; None for the usual ones."""
 
 
 class Operator(ABC):
@@ -126,14 +128,17 @@ class Ramp:
     def __init__(self, contract: Contract) -> None:
         self._low, self._high = contract.command_ranges.T
         self._dead_zone, self._step = contract.dead_zone, RAMP * contract.control_dt
-        self.command = np.zeros(3)
+        self._base, self._base_step = contract.base_commands.T, BASE_RAMP * contract.control_dt
+        self.restart()
 
     def restart(self) -> None:
-        """Set the command to zero at once."""
-        self.command = np.zeros(3)
+        """Set the command to zero at once, and height and pitch of the base to the usual ones."""
+        self.command, self.base = np.zeros(3), self._base[1]
 
     def advance(self, orders: Orders) -> np.ndarray:
-        """Return the command (3,) of this step: vx, vy [m/s], yaw rate [rad/s]."""
+        """Return the command (3,) of this step: vx, vy [m/s], yaw rate [rad/s]. `base` (2,) is the height [m] and the pitch
+        [rad] of this step.
+        """
         velocity = orders.velocity
         if orders.shares:
             velocity = np.where(velocity > 0.0, velocity * self._high, -velocity * self._low)
@@ -143,11 +148,16 @@ class Ramp:
         if np.hypot(*wanted[:2]) < self._dead_zone:
             wanted[:2] = 0.0
         self.command = self.command + np.clip(wanted - self.command, -self._step, self._step)
+        low, usual, high = self._base
+        asked = usual if orders.base is None else np.clip(orders.base, low, high)
+        self.base = self.base + np.clip(asked - self.base, -self._base_step, self._base_step)
         return self.command
 
 
 class Script(Operator):
-    """Commands from a file. Each line has a time [s] and either an event or vx, vy [m/s] and yaw rate [rad/s]."""
+    """Commands from a file. Each line has a time [s], and either an event or vx, vy [m/s] and yaw rate [rad/s], after which
+    height [m] and pitch [rad] of the base may follow.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read the file; empty lines and comments after # are skipped.
@@ -165,7 +175,7 @@ class Script(Operator):
             raise ConfigError(f"{path}: has no commands")
         if sorted(self._lines, key=lambda entry: entry[0]) != self._lines:
             raise ConfigError(f"{path}: its times must not decrease")
-        self._velocity = np.zeros(3)
+        self._command = np.zeros(3)
 
     @staticmethod
     def _parse(words: list[str], where: str) -> tuple[float, Event | np.ndarray]:
@@ -173,9 +183,10 @@ class Script(Operator):
             numbers = [float(word) for word in (words[:1] if len(words) == 2 else words)]
         except ValueError:
             numbers = [np.nan]
-        if len(words) not in (2, 4) or not np.isfinite(numbers).all():
-            raise ConfigError(f"{where}: expected 'time event' or 'time vx vy yaw_rate', got '{' '.join(words)}'")
-        if len(words) == 4:
+        if len(words) not in (2, 4, 6) or not np.isfinite(numbers).all():
+            forms = "'time event', 'time vx vy yaw_rate' or 'time vx vy yaw_rate height pitch'"
+            raise ConfigError(f"{where}: expected {forms}, got '{' '.join(words)}'")
+        if len(words) > 2:
             return numbers[0], np.array(numbers[1:])
         events = {event.value: event for event in Event}
         if words[1] not in events:
@@ -189,8 +200,9 @@ class Script(Operator):
             if isinstance(wanted, Event):
                 events.append(wanted)
             else:
-                self._velocity = wanted
-        return Orders(self._velocity, tuple(events))
+                self._command = wanted
+        velocity, base = self._command[:3], self._command[3:]
+        return Orders(velocity, tuple(events), base=base if len(base) else None)
 
 
 class _Device(Operator):

@@ -175,15 +175,15 @@ class Policy:
         self.actions = np.zeros(len(self.contract.acted))
         """(A,) last output of the network, clipped to plus and minus action_clip; NaN where the output is not finite."""
 
-    def act(self, reading: Reading, command: np.ndarray) -> np.ndarray:
-        """Return the joint targets (D,) [rad]. `command` (3,) is vx, vy [m/s] and yaw rate [rad/s]. Targets are NaN where the
-        network's output is not finite.
+    def act(self, reading: Reading, command: np.ndarray, base: np.ndarray | None = None) -> np.ndarray:
+        """Return the joint targets (D,) [rad]. `command` (3,) is vx, vy [m/s] and yaw rate [rad/s], `base` (2,) is height [m]
+        and pitch [rad] of the base, by default the usual ones. Targets are NaN where the network's output is not finite.
 
         Raises:
             KeyError: the reading lacks a source that the policy needs.
         """
         contract = self.contract
-        self.observation = self._observe(reading, command)
+        self.observation = self._observe(reading, command, contract.base_commands[:, 1] if base is None else base)
         given = self._network.run(self.observation).astype(float)
         actions = np.clip(given, -contract.action_clip, contract.action_clip)
         self.actions = np.where(np.isfinite(given), actions, np.nan)  # clipping has made infinite outputs finite
@@ -191,13 +191,14 @@ class Policy:
         targets[contract.acted] += contract.action_scale * self.actions
         return targets
 
-    def _observe(self, reading: Reading, command: np.ndarray) -> np.ndarray:
+    def _observe(self, reading: Reading, command: np.ndarray, base: np.ndarray) -> np.ndarray:
         """Return the observation (width,) float32: each group's history with the newest scaled, clipped terms at the end."""
         contract = self.contract
         values = {
             "base_ang_vel": reading.gyro,
             "projected_gravity": gravity_in(reading.quaternion),
             "commands": command,
+            "base_commands": base,
             "dof_pos": reading.positions - contract.default,
             "dof_vel": reading.velocities,
             "actions": self.actions,

@@ -215,7 +215,7 @@ class Program:
                 command = self._ramp.advance(Orders(np.zeros(3)) if halts else orders)
                 if halts and not command.any():
                     self._halting_s = (self._halting_s or 0.0) + contract.control_dt
-                targets = self._policy.act(reading, command)
+                targets = self._policy.act(reading, command, self._ramp.base)
                 self.walked_s += contract.control_dt
             else:
                 targets = along(self._path, (now - self._since) / self._path_s)

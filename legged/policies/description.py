@@ -10,7 +10,7 @@ from legged.config.actuator import MOTORS
 from legged.config.loader import to_dict
 from legged.config.networks import ESTIMATED, groups_of
 from legged.config.task import TaskConfig
-from legged.deploy.contract import CONTRACT_VERSION, need_of
+from legged.deploy.contract import BASE_COMMANDS, CONTRACT_VERSION, need_of
 from legged.envs import BaseTask, LeggedRobot, RobotTask, is_robot_task, is_velocity_task
 from legged.envs.marks import unit_of
 from legged.envs.motion_tracking import MotionTracking, is_tracking_task
@@ -72,9 +72,15 @@ def describe(task: BaseTask, trained: TaskConfig | None = None) -> dict[str, Any
 
 
 def describe_commands(task: LeggedRobot) -> dict[str, Any]:
-    """Return the ranges and the dead zone of velocity commands."""
+    """Return the ranges and the dead zone of velocity commands, and lowest, usual and highest command of height and pitch."""
     low, high = task.command_sampler.full_ranges.t().tolist()
+    usual, base = task.base_sampler.usual.tolist(), {}
+    if "base_commands" in task.cfg.observations.groups["actor"].terms:
+        ranges = task.base_sampler.ranges or [(value, value) for value in usual]
+        entries = ([low, rest, high] for rest, (low, high) in zip(usual, ranges, strict=True))
+        base = {"base_commands": dict(zip(BASE_COMMANDS, entries, strict=True))}
     return {
+        **base,
         "command_ranges": dict(zip(("vx", "vy", "yaw_rate"), zip(low, high, strict=True), strict=True)),
         "command_dead_zone": task.cfg.commands.small_command,
     }

@@ -105,6 +105,10 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
             r"command_ranges: must be finite, and not above the upper limits, got 1",
         ),
         (
+            {"base_commands": {"height": [0.5, 0.8, 0.7]}},
+            r"base_commands: must be finite, and sorted: lowest, usual, highest, got 0\.8",
+        ),
+        (
             {"observation_groups": [{"name": "actor", "start": 0, "size": 45, "history": 0}]},
             r"observation_groups: each must have a history and a size of at least 1",
         ),
@@ -304,6 +308,13 @@ def test_depth_and_numbers_of_the_file_are_bounded(text, says, tmp_path):
         read_contract(tmp_path / "policy.json")
 
 
+POSTURES = [
+    ("commands.ranges.base_height", [0.4, 0.6]),
+    ("commands.ranges.base_pitch", [-0.2, 0.3]),
+    ("observations.groups.actor.terms", ["base_ang_vel", "projected_gravity", "commands", "base_commands", "dof_pos"]),
+]
+
+
 def reading_of(task, robot, sources):
     """What a robot would measure where one of a task's is, from the engine's own numbers."""
     qpos, qvel = (tensor[robot].double().numpy() for tensor in (task.physics._qpos, task.physics._qvel))
@@ -322,8 +333,9 @@ def reading_of(task, robot, sources):
         ("anymal_c_flat", [("train.policy.rnn_type", "lstm"), ("train.policy.rnn_num_layers", 2)]),
         ("anymal_c_flat", [("train.policy.rnn_type", "gru"), ("control.held", ["HAA"])]),
         ("anymal_c_proprio", [*SMALL_TERRAIN, ("control.held", ["HAA"]), ("observations.joints", ["KFE", "HFE"])]),
+        ("anymal_c_flat", POSTURES),
     ],
-    ids=["height map", "shallow height map", "history", "LSTM", "GRU, held joints", "some joints"],
+    ids=["height map", "shallow height map", "history", "LSTM", "GRU, held joints", "some joints", "height and pitch"],
 )
 def test_the_program_sees_and_does_what_the_tasks_policy_does(name, changes, tmp_path):
     """Observations to 2e-5 in their scaled units, and actions to 1e-5, over an episode's first steps."""
@@ -344,7 +356,8 @@ def test_the_program_sees_and_does_what_the_tasks_policy_does(name, changes, tmp
     act = runner.get_inference_policy("cpu")
     task.reset()
     commands = torch.tensor([[0.5, 0.2, -0.3], [-0.4, 0.0, 0.8]])
-    observations = task.hold_commands(commands)
+    bases = torch.tensor([[0.55, 0.2], task.base_sampler.usual.tolist()])
+    observations = task.hold_commands(commands, base=bases)
     policies = [Policy(tmp_path) for _ in range(2)]
     sources = policies[0].contract.sources
     network.reset()
@@ -352,7 +365,8 @@ def test_the_program_sees_and_does_what_the_tasks_policy_does(name, changes, tmp
         with torch.inference_mode():
             actions = act(observations)
         for robot, policy in enumerate(policies):
-            targets = policy.act(reading_of(task, robot, sources), commands[robot].double().numpy())
+            base = None if robot else bases[0].double().numpy()  # the second robot gets the usual height
+            targets = policy.act(reading_of(task, robot, sources), commands[robot].double().numpy(), base)
             np.testing.assert_allclose(policy.observation, observations["actor"][robot], rtol=0.0, atol=2e-5)
             np.testing.assert_allclose(policy.actions, actions[robot], rtol=0.0, atol=1e-5)
             task.control.set_actions(actions)

@@ -3,13 +3,14 @@
 import os
 import signal
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import call, kept_global_state
 
 from legged.deploy.__main__ import ENDING, Interruptible, main
-from legged.deploy.operators import Event, Gamepad, Keyboard, Script
+from legged.deploy.operators import Event, Gamepad, Keyboard, Orders, Ramp, Script
 from legged.errors import ConfigError
 
 
@@ -185,12 +186,40 @@ def test_a_script_says_what_it_says_when_its_time_has_come(tmp_path):
     assert script.poll(9.0).events == (Event.STOP,)
 
 
+def test_a_script_may_command_height_and_pitch(tmp_path):
+    path = tmp_path / "walk.txt"
+    path.write_text("0 walk\n1 0.2 0 0 0.6 0.3\n2 0.1 0 0\n")
+    script = Script(path)
+    assert script.poll(0.5).base is None
+    orders = script.poll(1.0)
+    np.testing.assert_array_equal(orders.velocity, [0.2, 0.0, 0.0])
+    np.testing.assert_array_equal(orders.base, [0.6, 0.3])
+    assert script.poll(2.0).base is None
+
+
+def test_height_and_pitch_are_ramped_within_their_ranges_and_return_to_the_usual_ones():
+    """In steps of 0.1 s, 0.2 m/s are 0.02 m and 0.5 rad/s are 0.05 rad."""
+    base = np.array([[0.5, 0.7, 0.74], [-0.1, 0.0, 0.12]])
+    ramp = Ramp(SimpleNamespace(command_ranges=np.ones((3, 2)), dead_zone=0.1, control_dt=0.1, base_commands=base))
+    np.testing.assert_array_equal(ramp.base, [0.7, 0.0])
+    found = [ramp.advance(Orders(np.zeros(3), base=np.array([0.65, 0.3]))) is ramp.command and ramp.base for _ in range(4)]
+    np.testing.assert_allclose(found, [[0.68, 0.05], [0.66, 0.1], [0.65, 0.12], [0.65, 0.12]])
+    ramp.advance(Orders(np.zeros(3)))
+    np.testing.assert_allclose(ramp.base, [0.67, 0.07])
+    ramp.restart()
+    np.testing.assert_array_equal(ramp.base, [0.7, 0.0])
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("0 wlak", r"line 1: there is no event 'wlak'; did you mean 'walk'\?"),
-        ("0 damping\nnow stand", r"line 2: expected 'time event' or 'time vx vy yaw_rate', got 'now stand'"),
+        (
+            "0 damping\nnow stand",
+            r"line 2: expected 'time event', 'time vx vy yaw_rate' or 'time vx .* pitch', got 'now stand'",
+        ),
         ("0 1 2", "line 1: expected"),
+        ("0 1 2 3 0.6", "line 1: expected"),
         ("0 1 nan 2", "line 1: expected"),
         ("1 stand\n0 damping", "its times must not decrease"),
         ("# nothing", "has no commands"),
