@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 from legged.config.checks import DEEPEST, SHOWN, build, hints_of, plain_path, shown
 from legged.config.legged import LeggedConfig
 from legged.config.origins import Origins
-from legged.config.renamed import renamed
 from legged.config.task import TaskConfig
 from legged.config.yaml_files import dump, parse, read_yaml
 from legged.errors import ConfigError, suggest
@@ -94,14 +93,12 @@ def read_layers(source: Source, task: str, registered: Mapping[str, Registered] 
         if len(layers) == LONGEST_CHAIN:
             raise ConfigError(f"{name}: extends: the chain of `extends` has more than {LONGEST_CHAIN} files")
         seen.append(_mark(found))
-        data = renamed(read_yaml(given) if isinstance(given, Path) else given, name)
+        data = dict(read_yaml(given) if isinstance(given, Path) else given)
         if data.get("task", own := Path(task).name.removesuffix(".yaml").removesuffix(".yml")) != own:
             said = f"{shown(data['task'])}; remove this key"
             raise ConfigError(
                 f"{name}: task: the name of this task is '{own}', got {said}, or extend that task with `extends`"
             )
-        if isinstance(data.get("cpu"), Mapping):
-            data["cpu"] = renamed(data["cpu"], f"{name}: cpu")
         parent, kind, reference_robot = (data.pop(key, None) for key in ("extends", "class", "written_for"))
         own_rewards = data.pop("own_rewards", False)
         if not isinstance(own_rewards, bool):
@@ -291,7 +288,6 @@ def _merge_overrides(
         if key.count(".") > DEEPEST:
             raise ConfigError(f"command line: {shown(key)}: more than {DEEPEST} nested sections")
         layer = nest(key, robot_path(value, Path.cwd()) if key == "robot" else copy.deepcopy(value))
-        layer = renamed(layer, "command line")
         build(schema, layer, "command line")
         file_paths(layer, Path.cwd())
         merge(data, layer, "command line", origins)
@@ -306,7 +302,6 @@ def from_dict(
     """Build an instance of `schema` from nested plain values. `origins` holds the sources of the values. Without
     `origins`, all values are from `source`.
     """
-    data = data if origins is not None else renamed(data, source)
     cfg = build(schema, data, source, origins)
     if origins is None:
         origins = Origins()

@@ -115,7 +115,7 @@ def test_a_missing_task_and_an_unknown_flag(fails, main, name):
             ("command line: observations.groups.critic.terms", "did you mean 'dof_pos'?"),
         ),
         (
-            "observations.actor=[dof_poss]",
+            "observations.groups.actor.terms=[dof_poss]",
             ("command line: observations.groups.actor.terms", "did you mean 'dof_pos'?"),
         ),  # once
         ("terminations.failures=[contacts]", ("terminations.failures", "termination 'contacts'", "did you mean 'contact'?")),

@@ -21,7 +21,7 @@ COMMANDS = [  # not the same to both sides
     ("commands.ranges.ang_vel_yaw", [-0.7, 0.7]),
 ]
 SMALL = [("train.policy.actor_hidden_dims", [16, 8]), ("train.policy.critic_hidden_dims", [8]), *COMMANDS]
-BLIND = [("observations.actor", PROPRIOCEPTION), ("observations.actor_history", 2)]
+BLIND = [("observations.groups.actor.terms", PROPRIOCEPTION), ("observations.groups.actor.history", 2)]
 
 
 def exported(folder, *changes):

@@ -197,7 +197,7 @@ def test_a_stronger_robot_fits(contract):
 
 @pytest.mark.slow
 def test_a_policy_that_needs_more_than_sensors_is_refused_by_the_name_of_the_observation(tmp_path):
-    policy = Policy(exported(tmp_path, ("observations.actor", ["base_lin_vel", *PROPRIOCEPTION])))
+    policy = Policy(exported(tmp_path, ("observations.groups.actor.terms", ["base_lin_vel", *PROPRIOCEPTION])))
     with pytest.raises(ConfigError, match=r"observation: no sensor measures 'base_lin_vel', and 'still' has no source"):
         policy.contract.check_fits(facts_for(policy.contract))
     policy.contract.check_fits(facts_for(policy.contract, offers=frozenset({"base_lin_vel", "heights"})))

@@ -242,7 +242,9 @@ def test_a_terminal_that_is_held_or_closed_holds_nothing_up():
     ids=["silent", "too short"],
 )
 def test_a_policy_that_needs_a_source_stops_when_it_gives_nothing_more(tmp_path, after, says):
-    folder = exported(tmp_path, ("observations.actor", ["base_lin_vel", *dict(BLIND)["observations.actor"]]))
+    folder = exported(
+        tmp_path, ("observations.groups.actor.terms", ["base_lin_vel", *dict(BLIND)["observations.groups.actor.terms"]])
+    )
     facts = facts_for(Policy(folder).contract, offers=frozenset({"base_lin_vel"}))
     stage = Stage(folder, facts)
     speaks = spoil(sources=lambda _: {"base_lin_vel": np.array([0.3, 0.0, 0.0])})

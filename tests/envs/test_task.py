@@ -295,7 +295,11 @@ def test_a_subclass_with_terms_of_its_own_is_registered_from_outside(register):
     config = {
         **BASE,
         "rewards": {"scales": {"height": 2.0}},
-        "observations": {"actor": ["feet_height", "commands"], "scales": {"feet_height": 10.0}, "add_noise": False},
+        "observations": {
+            "groups": {"actor": {"terms": ["feet_height", "commands"]}},
+            "scales": {"feet_height": 10.0},
+            "add_noise": False,
+        },
         "custom": {"weight": 3.0},
     }
     register("hop", config, Hopper)

@@ -1,7 +1,6 @@
 """What is wrong with a user's task class or its settings is said in one line before anything is built."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,9 +8,7 @@ from helpers import TASK, small_config
 
 import legged
 from legged.config.legged import LeggedConfig
-from legged.config.renamed import renamed
 from legged.config.task import TaskConfig
-from legged.config.yaml_files import read_yaml
 from legged.envs import BaseTask, LeggedRobot
 from legged.envs.half_cheetah import HalfCheetah
 from legged.errors import ConfigError
@@ -67,12 +64,6 @@ def test_a_class_of_a_user_does_not_take_the_place_of_ours():
     register("other", {"class": "HalfCheetah"}, type("HalfCheetah", (BaseTask,), {}))
     assert task_class("half_cheetah") is HalfCheetah
     assert task_class("other") is not HalfCheetah
-
-
-@pytest.mark.parametrize("file", sorted(data_folder("cfg").glob("*.yaml")), ids=lambda path: path.stem)
-def test_our_own_files_use_the_names_of_today(file: Path):
-    data = read_yaml(file)
-    assert renamed(data, "") == data
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def poisoned_task() -> Poisoned:
     config = {
         "extends": TASK,
         "rewards": {"scales": {"mine": 1.0}},
-        "observations": {"critic": group, "actor": group, "actor_history": 2},
+        "observations": {"groups": {"critic": {"terms": group}, "actor": {"terms": group, "history": 2}}},
         "train": {"algorithm": {"symmetry": False}, "policy": {"actor_hidden_dims": [8], "critic_hidden_dims": [8]}},
     }
     register("poisoned", config, Poisoned)

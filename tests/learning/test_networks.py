@@ -24,7 +24,7 @@ from legged.policies.restore import TrainedPolicy, restore
 
 pytestmark = pytest.mark.usefixtures("workplace")
 
-UNLIKE = ["observations.critic=[dof_pos, base_lin_vel]", "observations.actor_history=2"]
+UNLIKE = ["observations.groups.critic.terms=[dof_pos, base_lin_vel]", "observations.groups.actor.history=2"]
 """The groups have different terms: 2 x 48 numbers, and 15."""
 NO_MIRROR = "train.algorithm.symmetry=false"
 RECURRENT = ["train.policy.rnn_hidden_dim=6", "train.algorithm.num_mini_batches=2", NO_MIRROR]
@@ -151,11 +151,11 @@ def test_terms_of_several_groups_lie_where_their_description_says():
 
 @pytest.mark.slow
 def test_networks_read_the_groups_that_they_are_told_to():
-    changes = [("observations.critic", ["dof_pos"]), ("train.policy.critic_observations", ["actor"])]
+    changes = [("observations.groups.critic.terms", ["dof_pos"]), ("train.policy.critic_observations", ["actor"])]
     alg = Runner(small_task(*changes)).alg
     assert (alg.actor.obs_dim, alg.critic.obs_dim) == (48, 48)
     both = ("train.policy.actor_observations", ["critic", "actor"])
-    alg = Runner(small_task(("observations.critic", ["dof_pos"]), both)).alg
+    alg = Runner(small_task(("observations.groups.critic.terms", ["dof_pos"]), both)).alg
     assert (alg.actor.obs_dim, alg.critic.obs_dim) == (60, 12)
 
 
@@ -279,7 +279,7 @@ def test_a_checkpoint_from_before_groups_had_names_is_resumed(capsys):
     resumed = tiny_run("--resume", "--load_run", str(folder), iterations=3)
     assert max(checkpoints(resumed)) == 2
     capsys.readouterr()
-    assert call(train.main, [*BASE, "--resume", "--load_run", str(folder), "observations.actor_history=3"]) == 2
+    assert call(train.main, [*BASE, "--resume", "--load_run", str(folder), "observations.groups.actor.history=3"]) == 2
     assert "its actor has history 2, the configuration has observations.groups.actor.history 3" in capsys.readouterr().err
 
 

@@ -197,16 +197,17 @@ def test_flags_that_do_not_go_together(capsys):
 
 TERMS = "base_lin_vel, base_ang_vel, projected_gravity, commands, dof_pos, dof_vel"
 DIFFERENT = {
-    "a term less": (f"observations.actor=[{TERMS}]", r"actor: term 7 is none here, 'actions' \(12\) there\n"),
+    "a term less": (f"observations.groups.actor.terms=[{TERMS}]", r"actor: term 7 is none here, 'actions' \(12\) there\n"),
     "another order": (
-        "observations.critic=[base_lin_vel, base_ang_vel, commands, projected_gravity, dof_pos, dof_vel, actions]",
+        "observations.groups.critic.terms="
+        "[base_lin_vel, base_ang_vel, commands, projected_gravity, dof_pos, dof_vel, actions]",
         r": critic: term 3 is 'commands' \(3\) here, 'projected_gravity' \(3\) there\n",
     ),
     "unknown there": (
-        f"observations.actor=[{TERMS}, heights]",
+        f"observations.groups.actor.terms=[{TERMS}, heights]",
         r"actor: term 7 is 'heights' here, 'actions' \(12\) there\n",
     ),
-    "history": ("observations.actor_history=3", r"actor: holds the last 3 observations here, the last 1 there\n"),
+    "history": ("observations.groups.actor.history=3", r"actor: holds the last 3 observations here, the last 1 there\n"),
     "groups": (
         "train.policy.critic_observations=[actor]",
         r"its critic has the observations \['critic'\], the configuration has train\.policy\.critic_observations \['actor'\]",
@@ -228,7 +229,7 @@ def test_what_differs_is_named_before_anything_is_built(capsys, monkeypatch, cha
 
 def test_every_group_that_differs_is_named(capsys):
     source = tiny_run()
-    fewer = [f"observations.{group}=[{TERMS}]" for group in ("actor", "critic")]
+    fewer = [f"observations.groups.{group}.terms=[{TERMS}]" for group in ("actor", "critic")]
     error = refused(capsys, "--transfer", str(source), *fewer)
     assert f"made for other observations than '{OTHER}': actor: term 7" in error
     assert "; critic: term 7" in error
@@ -237,7 +238,7 @@ def test_every_group_that_differs_is_named(capsys):
 def test_terms_of_another_width_are_named_when_the_task_is_built(capsys):
     """The same names, but 2 x 3 heights instead of 2 x 2."""
     points = ["terrain.measured_points_x=[0.0, 0.5]", "terrain.measured_points_y=[-0.5, 0.5]"]
-    heights = f"observations.critic=[{TERMS}, heights]"
+    heights = f"observations.groups.critic.terms=[{TERMS}, heights]"
     source = tiny_run(heights, *points)
     wider = ["terrain.measured_points_x=[0.0, 0.5, 1.0]", points[1]]
     error = refused(capsys, "--transfer", str(source), heights, *wider)
@@ -259,7 +260,7 @@ def test_a_checkpoint_that_says_nothing_of_itself_is_compared_by_its_runs_config
     saved["infos"] = {"learning_rate": saved["infos"]["learning_rate"]}
     torch.save(saved, source / "model_1.pt")
     assert "(no task named, iteration 1): actor and critic (8)" in said(capsys, str(source))
-    error = refused(capsys, "--transfer", str(source), f"observations.actor=[{TERMS}]")
+    error = refused(capsys, "--transfer", str(source), f"observations.groups.actor.terms=[{TERMS}]")
     assert "actor: term 7 is none here, 'actions' there" in error
     Path("elsewhere").mkdir()
     shutil.copy(source / "model_1.pt", "elsewhere")

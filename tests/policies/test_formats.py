@@ -28,7 +28,7 @@ SMALL = [
 BLIND = ["base_ang_vel", "projected_gravity", "commands", "dof_pos", "dof_vel", "actions"]
 GO2_MOTORS = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
 UNJOINTED = [name for name in BLIND if not name.startswith("dof_")]
-ONE_FRAME = [("observations.actor", BLIND)]
+ONE_FRAME = [("observations.groups.actor.terms", BLIND)]
 
 
 def trained(name, *changes):
@@ -171,9 +171,9 @@ def walk_along(task, runner, network, readers):
     ("name", "changes"),
     [
         ("anymal_c_flat", [("train.policy.obs_normalization", True), ("control.action_scale", 0.43857)]),
-        ("anymal_c_flat", [*ONE_FRAME, ("observations.actor_history", 6)]),
+        ("anymal_c_flat", [*ONE_FRAME, ("observations.groups.actor.history", 6)]),
         ("g1_flat", [("observations.clip", 0.3), ("control.clip_actions", 0.25)]),
-        ("anymal_c_flat", [("control.held", ["HFE"]), ("observations.actor", UNJOINTED)]),
+        ("anymal_c_flat", [("control.held", ["HFE"]), ("observations.groups.actor.terms", UNJOINTED)]),
     ],
     ids=["normalised", "history", "G1, clipped", "held joints"],
 )
@@ -188,9 +188,9 @@ def test_a_reader_of_mjlabs_metadata_does_what_the_policy_does(name, changes, tm
 @pytest.mark.parametrize(
     ("name", "changes", "motors"),
     [
-        ("go2_flat", [*ONE_FRAME, ("observations.actor_history", 3), ("control.action_scale", 0.1234)], GO2_MOTORS),
+        ("go2_flat", [*ONE_FRAME, ("observations.groups.actor.history", 3), ("control.action_scale", 0.1234)], GO2_MOTORS),
         ("g1_flat", ONE_FRAME, None),
-        ("g1_flat", [("control.held", ["shoulder", "elbow", "wrist"]), ("observations.actor", UNJOINTED)], None),
+        ("g1_flat", [("control.held", ["shoulder", "elbow", "wrist"]), ("observations.groups.actor.terms", UNJOINTED)], None),
     ],
     ids=["Go2, history", "G1", "G1, 15 actions"],
 )
@@ -210,7 +210,7 @@ def test_a_reader_of_deploy_yaml_does_what_the_policy_does(name, changes, motors
 
 @pytest.mark.slow
 def test_the_metadata_have_mjlabs_keys_and_numbers(tmp_path):
-    task, _, network = trained("anymal_c_flat", *ONE_FRAME, ("observations.actor_history", 2))
+    task, _, network = trained("anymal_c_flat", *ONE_FRAME, ("observations.groups.actor.history", 2))
     export_as(task, network, tmp_path, "mjlab")
     said = MjlabReader(tmp_path / "policy.onnx").metadata
     assert said["run_path"] == "none"
@@ -249,7 +249,7 @@ def test_the_metadata_have_mjlabs_keys_and_numbers(tmp_path):
         (
             "anymal_c_flat",
             "mjlab",
-            [("observations.actor", [*BLIND, "heights"])],
+            [("observations.groups.actor.terms", [*BLIND, "heights"])],
             r"observations\.groups\.actor: --format mjlab cannot express 'heights' of 187 numbers",
         ),
         ("go2_flat", "unitree", [], r"observations\.groups\.actor: --format unitree cannot express 'base_lin_vel'"),
