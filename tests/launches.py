@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from legged.physics.warp.launcher import Launcher
+from legged.mdp.kernels.task import TaskKernels
 
 NO_LAUNCH = ("detach", "empty", "empty_strided", "empty_like", "new_empty", "lift_fresh", "alias", "_unsafe_view")
 OURS = (*(f"legged.mdp.kernels.{of}" for of in ("task", "actuator", "network", "random")), "add_velocities")
@@ -41,17 +41,17 @@ class Launches(TorchDispatchMode):
 
 @contextmanager
 def counting() -> Iterator[Counter[str]]:
-    """Count in the block; physics engines' own launches are left out. What a `Launcher` launches counts once, also where it
-    has kept the launch of a step before.
+    """Count in the block; physics engines' own launches are left out. What a `TaskKernels` launches counts once, also where
+    it has kept the launch of a step before.
     """
-    launch, by_launcher, launches = wp.launch, Launcher.launch, Launches()
+    launch, by_launcher, launches = wp.launch, TaskKernels.launch, Launches()
 
     def noted(kernel: Any, *args: Any, **kwargs: Any) -> Any:
         if kernel.module.name in OURS or kernel.key in OURS:
             launches.note(sys._getframe(1))
         return launch(kernel, *args, **kwargs)
 
-    def noted_once(launcher: Launcher, kernel: Any, *args: Any, **kwargs: Any) -> None:
+    def noted_once(launcher: TaskKernels, kernel: Any, *args: Any, **kwargs: Any) -> None:
         launches.note(sys._getframe(1))
         wp.launch = launch
         try:
@@ -59,9 +59,9 @@ def counting() -> Iterator[Counter[str]]:
         finally:
             wp.launch = noted
 
-    wp.launch, Launcher.launch = noted, noted_once  # type: ignore[method-assign]
+    wp.launch, TaskKernels.launch = noted, noted_once  # type: ignore[method-assign]
     try:
         with launches:
             yield launches.by_part
     finally:
-        wp.launch, Launcher.launch = launch, by_launcher  # type: ignore[method-assign]
+        wp.launch, TaskKernels.launch = launch, by_launcher  # type: ignore[method-assign]

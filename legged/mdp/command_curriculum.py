@@ -56,9 +56,11 @@ class CommandCurriculum:
             return
         if self._kernels is not None:
             reached = torch.empty(2, *commands.shape, device=commands.device)
-            self._kernels.follow_commands(commands, lin_vel, ang_vel, valid, self._half_limit, self.share, reached)
+            now = (commands, lin_vel, ang_vel, valid)
+            self._kernels.launch("follow_commands", tuple(commands.shape), *now, self._half_limit, self.share, reached)
             rule = (float(self.window_steps), self.cfg.threshold, self.cfg.step)
-            self._kernels.widen_commands(reached.sum(dim=1), *rule, self._sums, self._steps.view(1), self.share)
+            kept = (self._sums, self._steps.view(1), self.share)
+            self._kernels.launch("widen_commands", 1, reached.sum(dim=1), *rule, *kept)
             return
         velocity = torch.cat([lin_vel[:, :2], ang_vel[:, 2:]], dim=1)
         size = commands.abs()

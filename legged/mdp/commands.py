@@ -106,7 +106,7 @@ class Commands:
         times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
         steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, self.ranges)
         written = (self.commands, self.standing, self.time_left, self.is_moving, self.renewed)
-        self._kernels.renew_commands(*masks, *drawn, base_quat, *times, *steering, MOVING, *written)
+        self._kernels.launch("renew_commands", len(reset), *masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Set fixed commands, (N, 3) or one (3,) for all robots. They are not sampled any more. With `heading` (N,) [rad] and

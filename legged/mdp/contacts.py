@@ -55,7 +55,8 @@ class FeetContacts:
         if self._kernels is not None:
             times = (self.air_time, self.last_air_time, self.contact_time)
             flags = (self.in_contact, self.first_contact, self._touching)
-            self._kernels.advance_feet(feet_forces, self.force, self.dt, *flags, *times)
+            dim = tuple(self.in_contact.shape)
+            self._kernels.launch("advance_feet", dim, feet_forces, self.force, self.dt, *flags, *times)
             return
         touching = feet_forces[:, :, 2] > self.force
         torch.logical_or(touching, self._touching, out=self.in_contact)

@@ -125,7 +125,7 @@ class Control:
             self._factors |= each
             wide = (values.expand_as(self.torques) for values in self._factors.values())
             law = (self.stiffness, self.damping, self.torque_limits, self._lowest_torques, self.zero_dof_pos)
-            self._kernels.vary_control(*wide, self._nominal_law, *law)
+            self._kernels.launch("vary_control", tuple(self.torques.shape), *wide, self._nominal_law, *law)
             return
         written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         for name, values in each.items():
@@ -178,7 +178,7 @@ class Control:
         if self.law == "P" and self._kernels is not None:
             gains = (each.expand_as(self.torques) for each in (self.stiffness, self.damping, self.torque_limits))
             shape = tuple(self.torques.shape)
-            self._kernels.hold_joints(shape, self._target, dof_pos, dof_vel, *gains, self.torques)
+            self._kernels.launch("hold_joints", shape, self._target, dof_pos, dof_vel, *gains, self.torques)
             return self.torques
         asked = self._law(dof_pos, dof_vel, self._target)
         return torch.clamp(asked, self._lowest_torques, self.torque_limits, out=self.torques)

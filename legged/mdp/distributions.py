@@ -97,7 +97,7 @@ class Distributions:
         if kernels is None:
             out.copy_(self.values(even, steps))
         else:
-            kernels.make_draws(even, self.source, self.table, steps.view(1), out)
+            kernels.launch("make_draws", tuple(out.shape), even, self.source, self.table, steps.view(1), out)
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
         """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.

@@ -241,7 +241,8 @@ class Disturbances:
             forces = self._no_forces if physics.forces is None else physics.forces
             state = (self._time_left, self._left, self._force, self.steps.view(1))
             found = (self._due, self._velocity, forces)
-            self._kernels.disturb(mask, self._drawn, self._dt, 0.5 * self._dt, self._bodies, *state, *found)
+            dim, times = (len(mask), max(forces.shape[1], 1)), (self._dt, 0.5 * self._dt)
+            self._kernels.launch("disturb", dim, mask, self._drawn, *times, self._bodies, *state, *found)
             if self.kicks:
                 physics.push(self._due, self._velocity)
         else:

@@ -68,7 +68,8 @@ class HeightMapErrors:
         if self._kernels is not None:
             chances = self._holes_drawn.values if self._holes_drawn is not None else self._drawn.values[:, :0]
             drawn = (begun, self._drawn.values, chances, self._share, self._lost)
-            self._kernels.advance_map(self.holes, *drawn, self.error, self.rate)
+            dim = (len(self.holes), max(self.holes.shape[1], 1))
+            self._kernels.launch("advance_map", dim, *drawn, self.error, self.rate, self.holes)
             return
         self.error.add_(self.rate)
         masked_set_(self.error, begun, self._drawn.values[:, :3])

@@ -176,7 +176,7 @@ class Randomization:
             choice, variants = (even, self._none) if self._choice is None else (self._choice.values, self.variants)
             source, table = (self._place[:0], self._none[:0]) if self._own is None else (self._own.source, self._own.table)
             made_of = even, source, table, self.steps.view(1), self._place, choice, variants
-            self._kernels.make_fresh(*made_of, self._new_chosen, self._fresh)
+            self._kernels.launch("make_fresh", tuple(self._fresh.shape), *made_of, self._new_chosen, self._fresh)
             return
         parts = []
         if self._own is not None and self._even is not None:
@@ -193,8 +193,8 @@ class Randomization:
         if self._kernels is not None:
             found = (self.steps_left, self._due, self._any_due, self.steps.view(1))
             choice = (self._chosen_at, self._new_chosen, self._chosen, self._chosen_due)
-            self._kernels.find_moments(reset, self._interval, *found, *choice)
-            self._kernels.take_fresh(self._due, self._moment, self._fresh, self.drawn)
+            self._kernels.launch("find_moments", len(reset), reset, self._interval, *found, *choice)
+            self._kernels.launch("take_fresh", tuple(self.drawn.shape), self._due, self._moment, self._fresh, self.drawn)
         else:
             self._find_moments(reset)
             torch.where(self._due.index_select(1, self._moment), self._fresh, self.drawn, out=self.drawn)
@@ -291,7 +291,7 @@ class Pushes:
         if self._kernels is not None:
             times = (self.dt, 0.5 * self.dt, self.cfg.push_interval_s)
             found = (self.push_time_left, self._due, self._delta)
-            self._kernels.find_pushes(mask, self._velocity.values, physics.qvel, *times, *found)
+            self._kernels.launch("find_pushes", len(mask), mask, self._velocity.values, physics.qvel, *times, *found)
             physics.push(self._due, self._delta)
             return
         self.push_time_left.sub_(self.dt)

@@ -80,7 +80,8 @@ class Rewards:
         stacked = torch.stack(values).float()
         if self._kernels is not None:
             rule = (self._factors, self._before_clip, valid, LARGEST, self.only_positive)
-            self._kernels.add_rewards(stacked, *rule, self.terms_finite, self.last, self.sums, self.total)
+            written = (self.terms_finite, self.last, self.sums, self.total)
+            self._kernels.launch("add_rewards", self.num_envs, stacked, *rule, *written)
             return self.total
         scaled = stacked * self._factors
         torch.lt(scaled.abs(), LARGEST, out=self.terms_finite)

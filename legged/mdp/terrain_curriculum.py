@@ -96,9 +96,8 @@ class TerrainCurriculum:
             judged = torch.empty(3, len(ended), device=ended.device)
             step = (ended, valid, commands, base_lin_vel, steps_left, self.dt)
             tiles = (self.rows, self._count, self._random, self.columns, self.tiles)
-            self._kernels.move_levels(
-                *step, self._far, PROMOTED, DEMOTED, *tiles, self.way, self.levels, self.origins, judged
-            )
+            written = (self.way, self.levels, self.origins, judged)
+            self._kernels.launch("move_levels", len(ended), *step, self._far, PROMOTED, DEMOTED, *tiles, *written)
             self._sums.add_(judged @ self._of_type.t())
             return
         speed = commands[:, :2].norm(dim=1)

@@ -132,7 +132,7 @@ class Actuator:
         now: tuple[Tensor | float, ...] = (line.kept, line.steps, line.age, line.decimation, dof_pos, dof_vel)
         rough = (friction.coulomb, friction.extra, friction.viscous, friction.stribeck_velocity, friction.smoothing)
         motor = (curve.stall_torque, curve.no_load_speed.expand_as(out))
-        self._kernels.drive_joints(tuple(out.shape), *now, *by_robot, *motor, *rough, self._has_friction, out)
+        self._kernels.launch("drive_joints", tuple(out.shape), *now, *by_robot, *motor, *rough, self._has_friction, out)
 
     def reset(self, mask: Tensor) -> None:
         """Begin new episodes of the robots in `mask` (N,). Every control step calls this, also if no episode ends."""

@@ -186,10 +186,11 @@ class ActuatorNetwork:
         """
         if self._kernels is not None:
             net = (self._weights, self._widths, self.state, self._scratch, self._found)
+            dim = tuple(error.shape)
             if self.kind == "mlp":
-                self._kernels.run_mlp(error, dof_vel, *self._scales, self._every, self._samples, *net)
+                self._kernels.launch("run_mlp", dim, error, dof_vel, *self._scales, self._every, self._samples, *net)
             else:
-                self._kernels.run_lstm(error, dof_vel, *self._scales, *net)
+                self._kernels.launch("run_lstm", dim, error, dof_vel, *self._scales, *net)
             return self._found
         found = self._mlp(error, dof_vel) if self.kind == "mlp" else self._lstm(error, dof_vel)
         return (self._torque * found).view(self.shape)

@@ -42,7 +42,7 @@ def drive_joints(
     has_friction: bool,
     torques: wp.array2d[float],
 ):
-    """Compute the torques of all joints. One thread per robot and joint. NaN stays NaN."""
+    """Compute the torques of joints under PD control (`Actuator.drive`). One thread per robot and joint. NaN stays NaN."""
     robot, joint = wp.tid()
     late = wp.max(delay[robot] - step, 0)
     age = wp.min((late + decimation - 1) // decimation, targets.shape[0] - 1)

@@ -53,8 +53,8 @@ def read_bodies(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
 ):
-    """Walk from the world to a body, link by link. One thread per world and body. `body_pos` to `reference` are the fields of
-    `BodyChains`.
+    """Walk from the world to a body, link by link (`BodyStates.update`). One thread per world and body. `body_pos` to
+    `reference` are the fields of `BodyChains`.
     """
     world, body = wp.tid()
     p, v, w = wp.vec3(), wp.vec3(), wp.vec3()

@@ -30,7 +30,9 @@ def run_mlp(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """Run the MLP. One thread per robot and joint. The weights (out, in) of each layer precede its biases."""
+    """Run the MLP (`ActuatorNetwork.torques`). One thread per robot and joint. The weights (out, in) of each layer precede
+    its biases.
+    """
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint
     for back in range(1, state.shape[1]):
@@ -72,9 +74,9 @@ def run_lstm(
     scratch: wp.array3d[float],
     torques: wp.array2d[float],
 ):
-    """Run the LSTM. One thread per robot and joint. For each layer, `weights` holds the weights of inputs (4 out, in), the
-    weights of hidden units (4 out, out), and the biases (4 out,), each in the order of the gates i, f, g, o. Even rows of
-    `state` hold hidden states, odd rows hold cell states.
+    """Run the LSTM (`ActuatorNetwork.torques`). One thread per robot and joint. For each layer, `weights` holds the weights
+    of inputs (4 out, in), the weights of hidden units (4 out, out), and the biases (4 out,), each in the order of the gates
+    i, f, g, o. Even rows of `state` hold hidden states, odd rows hold cell states.
     """
     robot, joint = wp.tid()
     row = robot * error.shape[1] + joint

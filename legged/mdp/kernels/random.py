@@ -22,8 +22,9 @@ def find_moments(
     chosen: wp.array[wp.int64],
     chosen_due: wp.array[wp.bool],
 ):
-    """Find the values that must be resampled now. One thread per robot. Column 0 of `due` is never true. Column 1 is true at
-    a reset, each further column at the end of an interval. If column `chosen_at` is true, the model variant changes.
+    """Find the values that must be resampled now (`Randomization.redraw`). One thread per robot. Column 0 of `due` is never
+    true. Column 1 is true at a reset, each further column at the end of an interval. If column `chosen_at` is true, the model
+    variant changes.
     """
     robot = wp.tid()
     something = wp.bool(reset[robot])
@@ -69,7 +70,7 @@ def make_draws(
     steps: wp.array[float],
     drawn: wp.array2d[float],
 ):
-    """Compute random values from uniform numbers. One thread per robot and column."""
+    """Compute random values from uniform numbers (`Distributions.values`). One thread per robot and column."""
     robot, column = wp.tid()
     drawn[robot, column] = drawn_value(even[robot, int(source[column])], column, table, steps[0])
 
@@ -86,8 +87,8 @@ def make_fresh(
     chosen: wp.array[wp.int64],
     fresh: wp.array2d[float],
 ):
-    """Compute new random values, and choose model variants. One thread per robot and column. A column whose `place` is beyond
-    the end of `table` takes its value from the chosen variant.
+    """Compute new random values, and choose model variants (`Randomization.draw`). One thread per robot and column. A column
+    whose `place` is beyond the end of `table` takes its value from the chosen variant.
     """
     robot, column = wp.tid()
     variant = wp.clamp(int(choice[robot, 0]), 0, variants.shape[0] - 1)
@@ -102,7 +103,7 @@ def make_fresh(
 
 @wp.kernel
 def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.array2d[float], drawn: wp.array2d[float]):
-    """Copy new random values to the robots for which they are due. One thread per robot and column."""
+    """Copy new random values to the robots that are due (`Randomization.redraw`). One thread per robot and column."""
     robot, column = wp.tid()
     if due[robot, wp.int32(moment[column])]:
         drawn[robot, column] = fresh[robot, column]
@@ -121,8 +122,8 @@ def vary_control(
     lowest: wp.array2d[float],
     zero: wp.array2d[float],
 ):
-    """Compute randomised gains, torque limits and joint offsets. One thread per robot and joint. `nominal` holds stiffness,
-    damping, torque limit and default angle of each joint.
+    """Compute randomised gains, torque limits and joint offsets (`Control.vary`). One thread per robot and joint. `nominal`
+    holds stiffness, damping, torque limit and default angle of each joint.
     """
     robot, joint = wp.tid()
     # All reads precede all writes, so that reads wait for memory together. The compiler moves no read ahead of a write.
@@ -152,9 +153,10 @@ def disturb(
     velocity: wp.array2d[float],
     total: wp.array3d[float],
 ):
-    """Update kicks and external forces. One thread per robot and body. The thread of body 0 (the world) updates the kicks.
-    `drawn` first holds seven numbers per kick: six of the velocity, and the interval. Then it holds five numbers per push:
-    three of the force, the interval, and the duration.
+    """Update kicks and external forces (`Disturbances.act`). One thread per robot and body. The thread of body 0 (the world)
+    updates the kicks. `drawn` first holds seven numbers per kick: six of the velocity, and the interval. Then it holds five
+    numbers per push: three of the force, the interval, and the duration. `total` (N, bodies, 6) receives the forces. The
+    caller applies the kicks: `velocity` where `due` is true.
     """
     robot, body = wp.tid()
     goes_on = wp.bool(mask[robot])
@@ -214,8 +216,8 @@ def advance_map(
     rate: wp.array2d[float],
     holes: wp.array2d[wp.bool],
 ):
-    """Update the errors of height maps. One thread per robot and map point, or per robot if maps have no holes. The last
-    column of `chances` decides whether the whole map is lost.
+    """Update the errors of height maps (`HeightMapErrors.advance`). One thread per robot and map point, or per robot if maps
+    have no holes. The last column of `chances` decides whether the whole map is lost.
     """
     robot, point = wp.tid()
     fresh = wp.bool(begun[robot])

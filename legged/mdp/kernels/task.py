@@ -3,6 +3,10 @@
 With the C engine, the same formulas run in torch. A test checks that kernels and torch give identical bits.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
 import torch
 import warp as wp
 from torch import Tensor
@@ -19,7 +23,6 @@ from legged.mdp.kernels.random import (
     take_fresh,
     vary_control,
 )
-from legged.physics.warp.launcher import Launcher
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -34,7 +37,9 @@ def hold_joints(
     limit: wp.array2d[float],
     torques: wp.array2d[float],
 ):
-    """Compute the torques of PD control, clipped at `limit`. One thread per robot and joint. Torques of NaN stay NaN."""
+    """Compute the torques of PD control, clipped at `limit` (`Control.compute`). One thread per robot and joint. Torques of
+    NaN stay NaN.
+    """
     robot, joint = wp.tid()
     spring = stiffness[robot, joint] * (target[robot, joint] - dof_pos[robot, joint])
     torque = spring - damping[robot, joint] * dof_vel[robot, joint]
@@ -58,7 +63,7 @@ def advance_feet(
     last_air_time: wp.array2d[float],
     contact_time: wp.array2d[float],
 ):
-    """Update the feet's contacts and times. One thread per robot and foot."""
+    """Update the feet's contacts and times (`FeetContacts.update`). One thread per robot and foot."""
     robot, foot = wp.tid()
     touching = forces[robot, foot][2] > threshold
     contact = touching or touched[robot, foot]
@@ -96,7 +101,7 @@ def renew_commands(
     is_moving: wp.array[wp.bool],
     renewed: wp.array[wp.bool],
 ):
-    """Resample commands, and steer towards headings unless `heading_gain` is 0. One thread per robot."""
+    """Resample commands, and steer towards headings unless `heading_gain` is 0 (`Commands.update`). One thread per robot."""
     robot = wp.tid()
     left = time_left[robot] - dt
     due = (reset[robot] or left <= last_moment) and not held[robot]
@@ -129,7 +134,7 @@ def find_pushes(
     due: wp.array[wp.bool],
     delta: wp.array2d[float],
 ):
-    """Find the robots that are pushed now, and their changes of velocity. One thread per robot."""
+    """Find the robots that are pushed now, and their changes of velocity (`Pushes.push`). One thread per robot."""
     robot = wp.tid()
     left = time_left[robot] - dt
     now = left <= last_moment and mask[robot]
@@ -152,7 +157,7 @@ def follow_commands(
     reached: wp.array3d[float],
 ):
     """Write the velocity in the direction of each command, and the command's size. Write zeros if the command is at most half
-    of its current limit, or if the robot is not `valid`. One thread per robot and axis.
+    of its current limit, or if the robot is not `valid` (`CommandCurriculum.update`). One thread per robot and axis.
     """
     robot, axis = wp.tid()
     command = commands[robot, axis]
@@ -178,7 +183,9 @@ def widen_commands(
     steps: wp.array[float],
     share: wp.array[float],
 ):
-    """Widen the ranges of commands. One thread for all three axes, since they share a counter of steps."""
+    """Widen the ranges of commands (`CommandCurriculum.update`). One thread for all three axes, since they share a counter of
+    steps.
+    """
     count = steps[0] + 1.0
     due = count >= window_steps
     for axis in range(3):
@@ -210,8 +217,8 @@ def scan_heights(
     heights: wp.array2d[float],
     ground: wp.array[float],
 ):
-    """Read the ground's heights at points around each robot. One thread per robot and point. The last point is the base's
-    position.
+    """Read the ground's heights at points around each robot (`HeightScan.update`). One thread per robot and point. The last
+    point is the base's position.
     """
     robot, point = wp.tid()
     w, x, y, z = base_quat[robot, 0], base_quat[robot, 1], base_quat[robot, 2], base_quat[robot, 3]
@@ -256,7 +263,9 @@ def move_levels(
     origins: wp.array2d[float],
     judged: wp.array2d[float],
 ):
-    """Add a control step to the robots' progress, and move robots between terrain levels. One thread per robot."""
+    """Add a control step to the robots' progress, and move robots between terrain levels (`TerrainCurriculum.update`). The
+    caller sums `judged` over robots. One thread per robot.
+    """
     robot = wp.tid()
     x, y = commands[robot, 0], commands[robot, 1]
     speed = wp.sqrt(x * x + y * y)
@@ -295,9 +304,9 @@ def add_rewards(
     sums: wp.array2d[float],
     total: wp.array[float],
 ):
-    """Add up the rewards of all terms. One thread per robot; each row of an array belongs to a term. The compiler moves no
-    read ahead of a write. So terms are processed in groups of four. The values and sums of a group are read first, so
-    that these reads wait for memory at the same time.
+    """Add up the rewards of all terms (`Rewards.compute`). One thread per robot; each row of an array belongs to a term. The
+    compiler moves no read ahead of a write. So terms are processed in groups of four. The values and sums of a group are read
+    first, so that these reads wait for memory at the same time.
     """
     robot = wp.tid()
     clipped, whole = wp.float32(0.0), wp.float32(0.0)
@@ -326,89 +335,56 @@ def add_rewards(
     total[robot] = wp.max(clipped, 0.0) + whole
 
 
-class TaskKernels(Launcher):
-    """Launches task kernels on an engine's device, in torch's current stream. All array arguments are torch tensors."""
+KERNELS = {
+    kernel.key: kernel
+    for kernel in (
+        *(hold_joints, drive_joints, run_mlp, run_lstm, advance_feet, renew_commands, find_pushes, follow_commands),
+        *(make_draws, make_fresh, find_moments, take_fresh, vary_control, disturb, advance_map, widen_commands),
+        *(scan_heights, read_bodies, move_levels, add_rewards),
+    )
+}
+"""Name -> kernel."""
+MOST_PREPARED = 200
+"""Largest number of recorded launches per task."""
 
-    def hold_joints(self, dim: tuple[int, ...], *arguments: Tensor) -> None:
-        """Launch the kernel of `Control.compute` for joints under PD control. The last argument receives the result."""
-        self.launch(hold_joints, dim, arguments)
 
-    def drive_joints(self, dim: tuple[int, ...], *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Actuator.drive` for joints under PD control. The last argument receives the result."""
-        self.launch(drive_joints, dim, arguments)
+class TaskKernels:
+    """Launches the kernels of this folder on an engine's device, on torch's current stream."""
 
-    def run_mlp(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` for an MLP. The last argument receives the result."""
-        self.launch(run_mlp, tuple(error.shape), (error, *arguments))
+    def __init__(self, on_device: Callable[[], AbstractContextManager[Any]]) -> None:
+        """Make all launches within the context that `on_device` returns."""
+        self._on_device = on_device
+        self._prepared: dict[tuple[Any, ...], Any] = {}
+        """Recorded CPU launches by kernel, dimension and arguments."""
 
-    def run_lstm(self, error: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `ActuatorNetwork.torques` for an LSTM. The last argument receives the result."""
-        self.launch(run_lstm, tuple(error.shape), (error, *arguments))
+    def launch(self, name: str, dim: int | tuple[int, ...], *arguments: Tensor | float) -> None:
+        """Launch the kernel called `name`. Its array arguments are torch tensors; an array of vectors is a tensor (..., 3).
 
-    def advance_feet(self, forces: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `FeetContacts.update`."""
-        self.launch(advance_feet, tuple(forces.shape[:2]), (forces, *arguments), vectors=1)
-
-    def renew_commands(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Commands.update`."""
-        self.launch(renew_commands, len(arguments[0]), arguments)  # type: ignore[arg-type]
-
-    def find_pushes(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Pushes.push` that finds the robots to push and their changes of velocity."""
-        self.launch(find_pushes, len(arguments[0]), arguments)  # type: ignore[arg-type]
-
-    def make_draws(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Distributions.values`. The last argument receives the result."""
-        self.launch(make_draws, tuple(arguments[-1].shape), arguments)
-
-    def make_fresh(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Randomization.draw`. The last two arguments receive the results."""
-        self.launch(make_fresh, tuple(arguments[-1].shape), arguments)
-
-    def find_moments(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Randomization.redraw` that finds the values to resample."""
-        self.launch(find_moments, len(arguments[0]), arguments)  # type: ignore[arg-type]
-
-    def take_fresh(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Randomization.redraw` that copies new values. The last argument receives them."""
-        self.launch(take_fresh, tuple(arguments[-1].shape), arguments)
-
-    def vary_control(self, *arguments: Tensor) -> None:
-        """Launch the kernel of `Control.vary`."""
-        self.launch(vary_control, tuple(arguments[-1].shape), arguments)
-
-    def disturb(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Disturbances.act`. It writes the forces to the last argument (N, bodies, 6). It also
-        determines the kicks, which the caller then applies.
+        On a CPU the launch is recorded, because preparing it takes longer than running it. The next call with the same
+        kernel, dimension and tensors replays it.
         """
-        total: Tensor = arguments[-1]  # type: ignore[assignment]
-        self.launch(disturb, (len(total), max(total.shape[1], 1)), arguments)
+        kernel = KERNELS[name]
+        with self._on_device():
+            key = None
+            if wp.get_device().is_cpu:
+                key = (name, dim, *(_identity(a) for a in arguments))
+                if prepared := self._prepared.get(key):
+                    prepared.launch()
+                    return
+            inputs = [
+                wp.from_torch(given, dtype=wanted.type.dtype) if isinstance(given, Tensor) else given
+                for given, wanted in zip(arguments, kernel.adj.args, strict=True)
+            ]
+            wp.launch(kernel, dim=dim, inputs=inputs)
+            if key is not None and (prepared := wp.launch(kernel, dim=dim, inputs=inputs, record_cmd=True)):
+                # The table fills up only if each step creates new tensors. Old launches are then useless, and are dropped.
+                if len(self._prepared) >= MOST_PREPARED:
+                    self._prepared.clear()
+                self._prepared[key] = prepared
 
-    def advance_map(self, holes: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `HeightMapErrors.advance`. `holes` (N, P) and the last two arguments receive the results."""
-        self.launch(advance_map, (len(holes), max(holes.shape[1], 1)), (*arguments, holes))
 
-    def follow_commands(self, commands: Tensor, *arguments: Tensor) -> None:
-        """Launch the kernel of `CommandCurriculum.update` that measures how far robots follow their commands."""
-        self.launch(follow_commands, tuple(commands.shape), (commands, *arguments))
-
-    def widen_commands(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `CommandCurriculum.update` that widens the ranges of commands."""
-        self.launch(widen_commands, 1, arguments)
-
-    def scan_heights(self, base_pos: Tensor, base_quat: Tensor, points_x: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `HeightScan.update`."""
-        dim = (len(base_pos), len(points_x))
-        self.launch(scan_heights, dim, (base_pos, base_quat, points_x, *arguments))
-
-    def read_bodies(self, pos: Tensor, *arguments: Tensor) -> None:
-        """Launch the kernel of `BodyStates.update`. The first six arguments are vectors."""
-        self.launch(read_bodies, tuple(pos.shape[:2]), (pos, *arguments), vectors=6)
-
-    def move_levels(self, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `TerrainCurriculum.update`. The caller sums the last argument (`judged`) over robots."""
-        self.launch(move_levels, len(arguments[0]), arguments)  # type: ignore[arg-type]
-
-    def add_rewards(self, values: Tensor, *arguments: Tensor | float) -> None:
-        """Launch the kernel of `Rewards.compute`. `values` (terms, N) are the values of all terms."""
-        self.launch(add_rewards, values.shape[1], (values, *arguments))
+def _identity(argument: Tensor | float) -> Any:
+    """Return a number unchanged. For a tensor, return the properties that a recorded launch depends on."""
+    if isinstance(argument, Tensor):
+        return argument.data_ptr(), argument.shape, argument.stride(), argument.dtype
+    return argument

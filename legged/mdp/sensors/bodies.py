@@ -58,7 +58,8 @@ class BodyStates(Sensor):
         if self._kernels is not None:
             links = (of["body_pos"], of["axis"], of["anchor"])
             rest = (of["body_quat"], of["kind"], of["position"], of["speed"], of["reference"], qpos, qvel)
-            self._kernels.read_bodies(self.pos, self.lin_vel, self.ang_vel, *links, self.quat, *rest)
+            written = (self.pos, self.lin_vel, self.ang_vel)
+            self._kernels.launch("read_bodies", tuple(self.pos.shape[:2]), *written, *links, self.quat, *rest)
             return
         pos, lin_vel, ang_vel = (torch.zeros_like(self.pos) for _ in range(3))
         quat = torch.zeros_like(self.quat)

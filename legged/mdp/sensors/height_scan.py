@@ -64,7 +64,8 @@ class HeightScan(Sensor):
             return
         if self._kernels is not None:
             points, ground = (self._x, self._y), (self._map, self._origin, self._cell, self._rows, self._columns)
-            self._kernels.scan_heights(base_pos, base_quat, *points, *ground, self.heights, self.ground)
+            dim = (len(base_pos), len(self._x))
+            self._kernels.launch("scan_heights", dim, base_pos, base_quat, *points, *ground, self.heights, self.ground)
             return
         yaw = yaw_of(base_quat).nan_to_num().unsqueeze(1)
         cos, sin = torch.cos(yaw), torch.sin(yaw)
