@@ -1,14 +1,10 @@
 """Command curriculum: ranges of commands widen while robots follow them."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from legged.config.legged import CommandCurriculumConfig
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
+from legged.mdp.kernels import Kernels
 
 
 class CommandCurriculum:
@@ -21,9 +17,7 @@ class CommandCurriculum:
 
     STATE = ("share", "_sums", "_steps")
 
-    def __init__(
-        self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float, kernels: "TaskKernels | None" = None
-    ) -> None:
+    def __init__(self, cfg: CommandCurriculumConfig, full_ranges: Tensor, dt: float, kernels: Kernels | None = None) -> None:
         """Set the widest ranges, `full_ranges` (3, 2). `dt` is the control step [s]."""
         self.cfg, self.full_ranges, self._kernels = cfg, full_ranges.clone(), kernels
         self._full_limit = full_ranges.abs().amax(dim=1)

@@ -1,16 +1,12 @@
 """Velocity commands: sampling, fixed commands, heading mode."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from legged.config.legged import CommandsConfig
 from legged.math import masked_set_, wrap_to_pi, yaw_of
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 MOVING = 0.1
 """Norm of (vx, vy, yaw rate) above which a command counts as motion."""
@@ -31,7 +27,7 @@ class Commands:
         num_envs: int,
         dt: float,
         device: torch.device,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
         numbers: RandomPool | None = None,
     ) -> None:
         """Set all commands to zero. The first `update` replaces them. `dt` is the control step [s]. Random numbers come from

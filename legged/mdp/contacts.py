@@ -1,14 +1,10 @@
 """Contact and swing times of the feet. They are updated whether or not a reward reads them."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from legged.math import masked_set_
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
+from legged.mdp.kernels import Kernels
 
 CONTACT_FORCE = 1.0
 """Vertical force above which a foot counts as in contact, for robots that weigh more than 100 N [N]."""
@@ -36,7 +32,7 @@ class FeetContacts:
         num_feet: int,
         dt: float,
         device: torch.device,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
         force: float = CONTACT_FORCE,
     ) -> None:
         """Clear all times and contacts. `dt` is the control step [s]; `force` is the threshold of a contact [N]."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,12 +12,10 @@ from legged.errors import ConfigError
 from legged.math import masked_set_
 from legged.mdp.actuators.actuator import Actuator, check_actuator, is_ideal
 from legged.mdp.actuators.model import Motors
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names, match_values
 from legged.robots.robot import Robot
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 
 class Control:
@@ -40,7 +37,7 @@ class Control:
         cfg: RobotControlConfig,
         torques: Tensor,
         sim_dt: float,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
         numbers: RandomPool | None = None,
         held_offsets: Tensor | None = None,
     ) -> None:

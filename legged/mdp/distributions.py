@@ -2,16 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool, Slice
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 KINDS = ("uniform", "log_uniform", "gaussian")
 
@@ -92,7 +89,7 @@ class Distributions:
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
 
-    def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: "TaskKernels | None") -> None:
+    def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: Kernels | None) -> None:
         """Write into `out` (N, V) what `values` would return, by one launch if `kernels` are given."""
         if kernels is None:
             out.copy_(self.values(even, steps))

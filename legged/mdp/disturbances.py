@@ -1,7 +1,6 @@
 """Disturbances: kicks of the base and forces on bodies, at random intervals for each robot, and goals of held joints."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,13 +10,11 @@ from legged.config.robot import RobotDomainRandConfig
 from legged.math import masked_set_, quat_rotate, uniform
 from legged.mdp.distributions import Distributions
 from legged.mdp.held_goals import HeldGoals
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.sensors import BodyStates
 from legged.physics import Physics
 from legged.robots.patterns import match_names
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 AXES = ("x", "y", "z")
 TURNS = ("roll", "pitch", "yaw")
@@ -133,7 +130,7 @@ class JointForces(Forces):
         dt: float,
         left: Tensor,
         force: Tensor,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Push at the joints with the names `joints` (J,) in the model. Other parameters are those of `Forces`."""
         super().__init__(cfg, 0, dt, left, force)
@@ -171,7 +168,7 @@ class Disturbances:
         dt: float,
         steps_per_iteration: int,
         numbers: RandomPool,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
         joint_names: Sequence[str] = (),
         goals: HeldGoals | None = None,
     ) -> None:

@@ -1,18 +1,15 @@
 """Errors of the height map that a robot builds while it walks: offset, drift and holes."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged.config.robot import HeightMapConfig
 from legged.math import masked_set_
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
 from legged.mdp.sensors.height_scan import HeightScan
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 
 def is_exact(cfg: HeightMapConfig) -> bool:
@@ -35,7 +32,7 @@ class HeightMapErrors:
         seen: Callable[[Tensor], Tensor],
         dt: float,
         numbers: RandomPool,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Set up maps around the bases. `pose` has their positions (N, 3) [m] and orientations (N, 4) in the world frame.
 

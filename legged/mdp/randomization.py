@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -11,11 +10,9 @@ from legged.config.randomization import DrawConfig, Range, draw_of
 from legged.config.robot import RobotDomainRandConfig
 from legged.math import masked_set_, uniform
 from legged.mdp.distributions import Distributions
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
 from legged.physics import FIELDS, Physics
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 VARIANTS = 1024
 """Number of variants of the model from which worlds choose if masses, inertias or armatures have `when: reset` or `interval`.
@@ -120,7 +117,7 @@ class Randomization:
         numbers: RandomPool,
         dt: float,
         steps_per_iteration: int,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Allocate buffers for draws during training, and reserve random numbers in the pool `numbers`. `dt` is the control
         step [s]. Does nothing if all fields are drawn only once, at the start.
@@ -270,7 +267,7 @@ class Pushes:
         num_envs: int,
         dt: float,
         device: torch.device,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
         numbers: RandomPool | None = None,
     ) -> None:
         """Draw the times of the first pushes, between 0 and one interval. `dt` is the control step [s]. Velocities are drawn

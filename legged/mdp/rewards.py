@@ -1,17 +1,14 @@
 """Reward terms: scaled, summed, clipped and recorded per episode."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from legged.graph.step_graph import calling
 from legged.math import masked_set_
+from legged.mdp.kernels import Kernels
 from legged.mdp.nan_guard import LARGEST
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 
 class Rewards:
@@ -28,7 +25,7 @@ class Rewards:
         dt: float,
         only_positive: bool,
         total: Tensor,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Build the sum of the terms in `functions`, with their `scales` by name. `dt` is the control step [s], or 1 for
         scales that are not per second. Sums are written to `total` (N,); with `only_positive` they are clipped at zero.

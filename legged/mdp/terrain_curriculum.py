@@ -1,16 +1,11 @@
 """Terrain curriculum: robots that follow their commands move to harder tiles, robots that fall short move to easier ones."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from legged.config.robot import TerrainConfig
+from legged.mdp.kernels import Kernels
 from legged.terrain.terrain import Terrain
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
-
 
 PROMOTED, DEMOTED = 0.8, 0.5
 """Share of the asked way above which a robot moves up a level, and share below which it moves down."""
@@ -38,7 +33,7 @@ class TerrainCurriculum:
         num_envs: int,
         dt: float,
         device: torch.device,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Spread robots evenly over the columns, at random levels up to cfg.max_init_terrain_level. `dt` is the control step
         [s].

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -12,12 +12,10 @@ from legged.config.actuator import ActuatorConfig
 from legged.config.checks import PLAIN, build, is_plain_name, plain_path, shown
 from legged.config.origins import Origins
 from legged.errors import ConfigError, suggest
+from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool
 from legged.robots.patterns import match_names
 from legged.robots.robot import Robot
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 MODELS = "control.actuator.models"
 """Setting that selects user-defined models."""
@@ -52,7 +50,7 @@ class Motors:
     """Pool in which a model reserves its random numbers."""
     rest: Callable[[], Tensor]
     """Function that returns the joint targets of action 0: (D,), (N, D) or ()."""
-    kernels: "TaskKernels | None" = None
+    kernels: Kernels | None = None
     origins: Origins | None = None
     """Sources of the settings, for error messages."""
     path: str = "control.actuator"

@@ -8,7 +8,7 @@ softsign. All joints share one network.
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import torch
@@ -17,9 +17,7 @@ from torch import Tensor
 from legged.errors import ConfigError, suggest
 from legged.math import masked_set_
 from legged.mdp.actuators.model import ActuatorModel, JointStep, Motors, modelled_joints
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
+from legged.mdp.kernels import Kernels
 
 KINDS = ("mlp", "lstm")
 FORMAT = 1
@@ -149,7 +147,7 @@ class ActuatorNetwork:
         joints: int,
         sim_dt: float,
         device: torch.device,
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Build the network, with all past errors, velocities and hidden states 0.
 

@@ -2,19 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from legged.math import quat_multiply, quat_rotate
+from legged.mdp.kernels import Kernels
 from legged.mdp.sensors.sensor import Sensor
 from legged.physics import Physics
 from legged.physics.body_chains import BALL, FREE, HINGE, SLIDE, BodyChains
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 
 class BodyStates(Sensor):
@@ -23,7 +20,7 @@ class BodyStates(Sensor):
     """
 
     def __init__(
-        self, physics: Physics, names: Sequence[str], kernels: "TaskKernels | None" = None, where: str = "BodyStates"
+        self, physics: Physics, names: Sequence[str], kernels: Kernels | None = None, where: str = "BodyStates"
     ) -> None:
         """Prepare to measure the bodies `names` of `physics.model`.
 

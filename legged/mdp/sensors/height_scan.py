@@ -1,17 +1,13 @@
 """Heights of the ground around robots, by lookup in the height map."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
 from legged.config.robot import TerrainConfig
 from legged.math import yaw_of
+from legged.mdp.kernels import Kernels
 from legged.mdp.sensors.sensor import Sensor
 from legged.terrain.terrain import Terrain
-
-if TYPE_CHECKING:
-    from legged.mdp.kernels.task import TaskKernels
 
 
 class HeightScan(Sensor):
@@ -27,7 +23,7 @@ class HeightScan(Sensor):
         cfg: TerrainConfig,
         terrain: Terrain | None,
         pose: tuple[Tensor, Tensor],
-        kernels: "TaskKernels | None" = None,
+        kernels: Kernels | None = None,
     ) -> None:
         """Build the grid of cfg.measured_points_x by cfg.measured_points_y, with x changing slowest. Without `terrain` the
         ground is a plane. `pose` has the bases' positions (N, 3) [m] and orientations (N, 4) in the world frame, which
