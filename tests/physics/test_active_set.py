@@ -101,23 +101,6 @@ def test_wrong_states_cost_iterations_only(device, source):
     assert wrong.read("solver_niter").mean() > right.read("solver_niter").mean()
 
 
-def test_a_state_of_a_run_from_before_they_were_kept_is_taken(robot, make_physics):
-    """Nothing is known of its rows then; the next step goes where it would have gone."""
-    physics = make_physics("mujoco_warp", num_envs=6)
-    states = heaps(robot, 6, seed=3)
-    physics.write(torch.ones(6, dtype=torch.bool), states.qpos, states.qvel)
-    for _ in range(60):  # they land after 30
-        physics.step()
-    saved = {name: tensor.clone() for name, tensor in physics.state_tensors().items()}
-    physics.step()
-    after = physics.qpos.clone()
-    assert saved.pop("last_rows")[:, 0].any()
-    physics.load_state(saved)
-    assert not physics.state_tensors()["last_rows"].any()
-    physics.step()
-    torch.testing.assert_close(physics.qpos, after, atol=1e-5, rtol=0.0)
-
-
 @pytest.mark.parametrize("engine", ["mujoco_warp", on_gpu("mujoco_warp, cuda")])
 def test_a_world_that_is_put_into_another_state_begins_as_if_it_were_new(robot, make_physics, engine):
     """Heaps of robots land, then some are put back; those go where they went at first, to the bit."""

@@ -294,12 +294,6 @@ class MujocoWarpPhysics(WarpPhysics):
             own["last_rows"] = wp.to_torch(self._contacts.active_set.last)
         return {**super().state_tensors(), **own, **self._of_last_step()}
 
-    def load_state(self, saved: Mapping[str, Tensor]) -> None:
-        # A state without "last_rows" comes from an older version of legged, whose solver did not keep the active set.
-        if self._contacts is not None and "last_rows" not in saved:
-            saved = {**saved, "last_rows": torch.zeros_like(wp.to_torch(self._contacts.active_set.last))}
-        super().load_state(saved)
-
     def randomize(self, field: str, values: Tensor) -> None:
         for name, array in self._randomized.give(field, values).items():
             self._array(name).copy_(array.view_as(self._array(name)))
