@@ -9,7 +9,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from legged.physics.quantities import found
+from legged.errors import suggest
 from legged.physics.robot_state import RobotState
 from legged.state import take
 
@@ -127,13 +127,25 @@ class Physics(ABC):
         Raises:
             ValueError: the physics was not made for this quantity.
         """
-        return found(name, self._quantities)
+        if name not in self._quantities:
+            hint = suggest(name, self._quantities, "it was made for")
+            raise ValueError(f"quantity: the physics was not made for '{name}'{hint}")
+        return self._quantities[name]
 
     @abstractmethod
     def state_tensors(self) -> dict[str, Tensor]:
         """Return the arrays (N, ...) that, with `ctrl`, determine the following steps. Outputs of the last step are included.
         After `load_state` with copies of these arrays, the engine repeats the same steps; on a CPU they are bit-identical.
         """
+
+    def _shared_state(self) -> dict[str, Tensor]:
+        """Return those of `state_tensors` that do not depend on the engine."""
+        state = {f"forces_{name}": forces for name, forces in self.group_forces.items()}
+        if self.robot_state is not None:
+            state["contact_forces"] = self.robot_state.contact_forces
+        if self.forces is not None:
+            state["forces"] = self.forces
+        return state
 
     def _clear_groups(self, mask: Tensor) -> None:
         """Set `group_forces` to zero in the worlds of `mask` (N,)."""

@@ -42,13 +42,7 @@ class MujocoPhysics(Physics):
         quantities: Collection[str] = (),
         pushed: bool = False,
     ) -> None:
-        """Build the scene and set all worlds to the model's initial state.
-
-        Raises:
-            ValueError: `device` is not the CPU.
-        """
-        if device.type != "cpu":
-            raise ValueError(f"the engine mujoco runs on the CPU only, not on {device}")
+        """Build the scene and set all worlds to the model's initial state. `device` is the CPU."""
         keep_out_of_files()
         self.num_envs, self.dt, self.device = num_envs, sim.dt, device
         self.model = scene.model(sim, contact_sensors=True)
@@ -167,12 +161,7 @@ class MujocoPhysics(Physics):
 
     def state_tensors(self) -> dict[str, Tensor]:
         state = {"qpos": self._qpos, "qvel": self._qvel, "act": self._act, "warmstart": self._warmstart}
-        if self.robot_state is not None:
-            state["contact_forces"] = self.robot_state.contact_forces
-        if self.forces is not None:
-            state["forces"] = self.forces
-        groups = {f"forces_{name}": forces for name, forces in self.group_forces.items()}
-        return {**state, **self._reader.of_last_step, **groups}
+        return {**state, **self._reader.of_last_step, **self._shared_state()}
 
     def load_state(self, saved: Mapping[str, Tensor]) -> None:
         self._reader.stale.fill_(True)

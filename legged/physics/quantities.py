@@ -1,9 +1,8 @@
 """Arrays of MuJoCo's data that a task may request, and the computation that each one needs."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 
 import mujoco
-from torch import Tensor
 
 from legged.errors import suggest
 
@@ -35,14 +34,3 @@ def check_quantities(names: Collection[str]) -> None:
 def stage_of(names: Collection[str]) -> int:
     """Return the last forward stage that `names` need, or 0 if they need no stage."""
     return max((int(STAGES[name]) for name in names if name in STAGES), default=0)
-
-
-def found(name: str, quantities: Mapping[str, Tensor]) -> Tensor:
-    """Return the tensor of a quantity.
-
-    Raises:
-        ValueError: the physics was not made for this quantity.
-    """
-    if name not in quantities:
-        raise ValueError(f"quantity: the physics was not made for '{name}'{suggest(name, quantities, 'it was made for')}")
-    return quantities[name]

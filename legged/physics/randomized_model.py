@@ -112,14 +112,10 @@ def check_ranges(
     `DrawConfig`). `where` maps a dotted path of the configuration to the beginning of an error message.
 
     Raises:
-        ConfigError: a field does not exist, the scene has nothing that the field changes, or the lowest value is too low, for
-            example because it leaves no mass.
+        ConfigError: the scene has nothing that a field changes, or the lowest value is too low, for example because it leaves
+            no mass.
     """
     model = scene.model(sim, "none") if ranges else None  # no field changes the ground, so it is left out
-    for name in ranges:
-        if name not in FIELDS:
-            path = where("domain_rand.ranges")
-            raise ConfigError(f"{path}: there is no field '{name}'{suggest(name, FIELDS, 'fields')}")
     given = RandomizedModel(scene, model, ranges, torch.float64, torch.device("cpu")) if model else None
     for name in FIELDS.ordered(ranges):
         assert given is not None

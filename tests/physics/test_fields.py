@@ -290,7 +290,6 @@ def test_a_shipped_robot_without_dampers_can_be_given_some(robot, engine):
 @pytest.mark.parametrize(
     ("ranges", "error"),
     [
-        ({"frictoin": (0.5, 1.0)}, r"mine.yaml: domain_rand.ranges: .*'frictoin'; did you mean 'friction'\?"),
         ({"friction": (-0.5, 1.0)}, r"mine.yaml: domain_rand.ranges.friction: .* -0.5 .*geom_friction -0.5"),
         ({"added_base_mass": (-50.0, 1.0)}, r"ranges.added_base_mass: .* makes body_mass -4"),
         ({"link_mass": (0.0, 1.0)}, r"ranges.link_mass: .* makes body_mass 0"),
@@ -300,7 +299,6 @@ def test_a_shipped_robot_without_dampers_can_be_given_some(robot, engine):
             r"ranges.com_x:left_thihg: .* has no body 'left_thihg'; did you mean 'left_thigh'\?",
         ),
         ({"added_mass:left_thigh": (-5.0, 1.0)}, r"ranges.added_mass:left_thigh: .* \(mass added to left_thigh\), makes"),
-        ({"com:left_thigh": (0.0, 1.0)}, r"domain_rand.ranges: there is no field 'com:left_thigh'"),
         ({"joint_damping": (-1.5, 1.0)}, r"ranges.joint_damping: .* makes dof_damping -0.5"),
     ],
 )

@@ -11,8 +11,7 @@ from reference import FIELDS, TOUCHING, CWorlds, States, assert_same, bits, heap
 
 from legged.config.world import SimConfig
 from legged.errors import ConfigError
-from legged.physics import MANY_WORLDS, RobotScene, resolve_physics
-from legged.physics.mujoco import MujocoPhysics
+from legged.physics import MANY_WORLDS, resolve_physics
 from legged.physics.warp.mujoco_warp import absent_stages
 
 
@@ -262,11 +261,6 @@ def test_make_physics_builds_what_is_named(make_physics, backend):
     )
     assert built.capturable == (name != "mujoco")
     assert built.qpos.device.type == (gpu or "cpu")
-
-
-def test_the_c_engine_is_not_built_for_a_gpu(robot):
-    with pytest.raises(ValueError, match="runs on the CPU"):
-        MujocoPhysics(RobotScene(robot), SimConfig(), 1, torch.device("cuda:0"))
 
 
 def test_copy_to_shows_one_world_as_it_is_now(physics, robot):

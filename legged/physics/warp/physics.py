@@ -91,13 +91,7 @@ class WarpPhysics(Physics):
             self._state_io.push(mask, delta, self.qvel)
 
     def state_tensors(self) -> dict[str, Tensor]:
-        groups = {f"forces_{name}": forces for name, forces in self.group_forces.items()}
-        state = {"qpos": self.qpos, "qvel": self.qvel, **groups}
-        if self.robot_state is not None:
-            state["contact_forces"] = self.robot_state.contact_forces
-        if self.forces is not None:
-            state["forces"] = self.forces
-        return state
+        return {"qpos": self.qpos, "qvel": self.qvel, **self._shared_state()}
 
     def copy_to(self, env_id: int, data: mujoco.MjData) -> None:
         data.qpos[:] = self.qpos[env_id].cpu().numpy().astype(np.float64)
