@@ -98,10 +98,9 @@ def standing_torques(model: mujoco.MjModel, qpos: np.ndarray, joints: Sequence[i
 
 def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     """Return the joint-space inertia (V, V) of V degrees of freedom. `mj_forward` must have filled `data`."""
-    columns = np.zeros((model.nv, model.nv))
-    for i, unit in enumerate(np.eye(model.nv)):
-        mujoco.mj_mulM(model, data, columns[i], unit)
-    return columns
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    return full
 
 
 def _inverse_inertia(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[mujoco.MjData, np.ndarray]:

@@ -91,18 +91,12 @@ class PassiveJoints:
         mujoco.mj_makeConstraint(self.model, data)  # no contacts are made, because no collisions were computed
         rows = np.flatnonzero(np.asarray(data.efc_type) == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
         jacobian = np.zeros((data.nefc, self.model.nv))
-        if len(rows):
-            jacobian[:] = self._dense(data)
+        if mujoco.mj_isSparse(self.model) and len(rows):
+            places = (data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+            mujoco.mju_sparse2dense(jacobian, data.efc_J, *places)
+        elif len(rows):
+            jacobian[:] = data.efc_J.reshape(data.nefc, self.model.nv)
         return np.asarray(data.efc_pos)[rows], jacobian[rows]
-
-    def _dense(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the Jacobian of all constraints, (nefc, nv)."""
-        if not mujoco.mj_isSparse(self.model):
-            return np.asarray(data.efc_J).reshape(data.nefc, self.model.nv)
-        dense = np.zeros((data.nefc, self.model.nv))
-        for row, (start, count) in enumerate(zip(data.efc_J_rowadr, data.efc_J_rownnz, strict=True)):
-            dense[row, data.efc_J_colind[start : start + count]] = data.efc_J[start : start + count]
-        return dense
 
     def beyond(self, qpos: np.ndarray) -> list[str]:
         """Return the names of the passive hinges and slides that are outside their ranges at `qpos` (nq,)."""
