@@ -81,7 +81,12 @@ class Commands:
         time is up, then steer towards the headings. `base_quat` (N, 4) are the orientations of the bases.
         """
         if self._kernels is not None:
-            self._update_in_one_launch(reset, base_quat)
+            masks = (reset, self.held, self.steered)
+            drawn = (self._sample, self._sample_standing)
+            times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
+            steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, self.ranges)
+            written = (self.commands, self.standing, self.time_left, self.is_moving, self.renewed)
+            self._kernels.launch("renew_commands", len(reset), *masks, *drawn, base_quat, *times, *steering, MOVING, *written)
             return
         self.time_left.sub_(self.dt)
         torch.gt(reset | (self.time_left <= 0.5 * self.dt), self.held, out=self.renewed)  # for masks: a and not b
@@ -94,15 +99,6 @@ class Commands:
             steered = self.steered & ~self.standing
             self.commands[:, 2].copy_(torch.where(steered, (HEADING_GAIN * error).clamp(low, high), self.commands[:, 2]))
         torch.gt(self.commands[:, :3].norm(dim=1), MOVING, out=self.is_moving)
-
-    def _update_in_one_launch(self, reset: Tensor, base_quat: Tensor) -> None:
-        assert self._kernels is not None
-        masks = (reset, self.held, self.steered)
-        drawn = (self._sample, self._sample_standing)
-        times = (self.dt, 0.5 * self.dt, self.cfg.resampling_time_s)
-        steering = (HEADING_GAIN if self.cfg.heading_command else 0.0, self.ranges)
-        written = (self.commands, self.standing, self.time_left, self.is_moving, self.renewed)
-        self._kernels.launch("renew_commands", len(reset), *masks, *drawn, base_quat, *times, *steering, MOVING, *written)
 
     def hold(self, commands: Tensor, heading: Tensor | None = None) -> None:
         """Set fixed commands, (N, 3) or one (3,) for all robots. They are not sampled any more. With `heading` (N,) [rad] and

@@ -77,15 +77,13 @@ def add_terrain(
     return add.added
 
 
-def add_height_field(
-    spec: mujoco.MjSpec, ground: HeightMap, material: str | None = None, collide: bool = True, depth: float = DEPTH
-) -> mujoco.MjsGeom:
+def add_height_field(spec: mujoco.MjSpec, ground: HeightMap) -> mujoco.MjsGeom:
     """Add the whole map to the world body as one height field, `terrain_0`. Vertical faces become slopes at least one cell
     wide.
 
     Where corners of neighbouring cells differ in height, the height field's point lies at their mean.
     """
-    add = _Geoms(spec, ground, float(ground.corners.min()) - depth, _attributes(material, collide))
+    add = _Geoms(spec, ground, float(ground.corners.min()) - DEPTH, _attributes(None, collide=True))
     add.surface(0, 0, lattice_heights(ground))
     return add.added[0]
 
