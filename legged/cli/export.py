@@ -44,8 +44,8 @@ def export(args: argparse.Namespace) -> int:
     A policy that tracks motions has a file policy_<motion>.onnx besides, for each motion. `legged motion` reads the motion
     in this file, and `legged evaluate onnx` replays it.
 
-    With --format mjlab or unitree, each folder has a policy.onnx with mjlab's metadata, and for unitree a deploy.yaml. What
-    the format cannot express is an error.
+    With --format mjlab or unitree, each folder has a policy.onnx with mjlab's metadata, and for unitree a deploy.yaml. With
+    --format league, it has policies/<task>/ for the G1 walking league. What the format cannot express is an error.
     """
     register_given(args, "policy")
     if args.checkpoint is not None:

@@ -1,7 +1,7 @@
-"""Exports in the formats of other programs: ONNX files with mjlab's metadata, and Unitree's deploy.yaml.
+"""Exports in the formats of other programs: ONNX files with mjlab's metadata, Unitree's deploy.yaml, entries of a league.
 
-Both have unscaled observations, with the history of each term by itself, oldest first. The network in the ONNX file begins
-with their conversion: columns are sorted, scaled and clipped. It also corrects what numbers of 3 decimals lose.
+The first two have unscaled observations, with the history of each term by itself, oldest first. The network in the ONNX file
+begins with their conversion: columns are sorted, scaled and clipped. It also corrects what numbers of 3 decimals lose.
 """
 
 from collections.abc import Iterable
@@ -22,9 +22,10 @@ from legged.deploy.unitree import KINDS
 from legged.envs import BaseTask
 from legged.policies.description import describe
 from legged.policies.export import CHECKED_OBSERVATIONS, LARGEST_DIFFERENCE, ExportError, onnx_of
+from legged.policies.league_format import check_entry, write_entry
 from legged.process.paths import make_folder, write_bytes, write_text
 
-FORMATS = ("legged", "mjlab", "unitree")
+FORMATS = ("legged", "mjlab", "unitree", "league")
 DECIMALS = 3
 """Decimals of default angles, scales, gains and command ranges."""
 
@@ -78,7 +79,8 @@ class Converted(nn.Module):
 @torch.inference_mode()
 def export_as(task: BaseTask, policy: Any, folder: Path, form: str, run: str = "") -> float:
     """Write `policy`, rsl-rl's actor network on the CPU, to `folder` as policy.onnx, and for `form` "unitree" also as
-    deploy.yaml. Return the largest difference of the file's actions from the policy's. `run` is the path of the run.
+    deploy.yaml. For `form` "league", write policies/<task>/ there instead. Return the largest difference of the file's
+    actions from the policy's. `run` is the path of the run.
 
     Raises:
         ConfigError: the format cannot express the policy.
@@ -86,6 +88,8 @@ def export_as(task: BaseTask, policy: Any, folder: Path, form: str, run: str = "
         RunError: a file cannot be written.
     """
     contract = _expressible(task, form)
+    if form == "league":
+        return write_entry(policy, contract, folder, run)
     names = [contract.joint_names[i] for i in contract.acted]
     motors = sdk_names(len(contract.joint_names)) if form == "unitree" else None
     order = sorted(range(len(names)), key=lambda i: (motors or names).index(names[i]))
@@ -117,9 +121,12 @@ def _expressible(task: BaseTask, form: str) -> Contract:
         raise wrong("task", f"--format {form} is for policies that follow velocity commands, got '{cfg.task}'{hint}")
     if cfg.control.laws != {"P"}:
         raise wrong("control.control_type", f"--format {form} knows joint position targets only (P)")
-    if cfg.train.policy.rnn_type != "none":
+    if form != "league" and cfg.train.policy.rnn_type != "none":
         raise wrong("train.policy.rnn_type", f"--format {form} has no hidden state, got '{cfg.train.policy.rnn_type}'")
     described = describe(task)
+    if form == "league":
+        check_entry(cfg, described)
+        return contract_of(Path(cfg.task), described)
     joints, acted, seen = (
         described["joint_names"],
         described["action_joints"],
