@@ -105,7 +105,7 @@ class Entry(nn.Module):
         given = self.network(seen, *memory)
         actions, *memory = given if memory else (given,)
         actions = actions.clip(-clip, clip)
-        kept = [torch.ones_like(later), actions, seen, *(x.transpose(0, 1).flatten(1) for x in memory if x is not None)]
+        kept = [later.clip(min=1.0), actions, seen, *(x.transpose(0, 1).flatten(1) for x in memory if x is not None)]
         return self._default + self._scale * actions[:, self._action], torch.cat(kept, dim=1).unsqueeze(0)
 
     def as_onnx(self, verbose: bool = False) -> "Entry":
