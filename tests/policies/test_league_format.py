@@ -151,12 +151,12 @@ def entry_of(name, folder, *changes):
     [
         ("g1_teleop", [("train.policy.obs_normalization", True), *TRUE]),
         ("g1_flat", [("observations.clip", 0.3), ("control.clip_actions", 0.25), ("control.action_scale", 0.4386)]),
-        ("g1_flat", [("control.held", [*ARMS, "waist"]), ("observations.actor", [*BLIND, "held_targets"])]),
+        ("g1_flat", [("control.held", [*ARMS, "waist"]), ("observations.groups.actor.terms", [*BLIND, "held_targets"])]),
         (
             "g1_flat",
             [
                 *ONE_FRAME,
-                ("observations.actor_history", 2),
+                ("observations.groups.actor.history", 2),
                 ("train.policy.rnn_type", "lstm"),
                 ("train.policy.rnn_hidden_dim", 8),
                 ("train.policy.rnn_num_layers", 2),
@@ -198,7 +198,9 @@ def test_an_entry_does_what_the_policy_does(reader, name, changes, tmp_path):
 def test_the_class_states_gains_limits_and_the_networks_ends(tmp_path):
     ranges = {"lin_vel_x": [-0.3, 0.8], "lin_vel_y": [-0.4, 0.2], "ang_vel_yaw": [-1.0, 0.6]}
     changes = [(f"commands.ranges.{key}", value) for key, value in ranges.items()]
-    task, _, _, folder = entry_of("g1_flat", tmp_path, ("control.held", ARMS), ("observations.actor", BLIND), *changes)
+    task, _, _, folder = entry_of(
+        "g1_flat", tmp_path, ("control.held", ARMS), ("observations.groups.actor.terms", BLIND), *changes
+    )
     entry = Compiled(folder, ROBOTS)
     # 3 gyro, 3 gravity, 3 command, 29 angles, 29 speeds; a mark, 15 actions, an observation of 9 + 2 * 29 + 15 numbers
     assert entry.said == "policies/g1_flat/model.onnx obs,-1,67 state_in,1,-1,98 actions,-1,15 state_out,1,-1,98"
@@ -229,7 +231,7 @@ def test_the_name_of_an_entry_is_a_name_in_cpp():
         ),
         (
             "g1_flat",
-            [("observations.actor", [*BLIND, "heights"])],
+            [("observations.groups.actor.terms", [*BLIND, "heights"])],
             r"observations\.groups\.actor: --format league cannot express 'heights' of 187 numbers \(known: base_ang_vel, ",
         ),
         (
