@@ -49,12 +49,13 @@ Act = Callable[[LeagueTask, TensorDict], Tensor]
 """Task and observations -> actions (N, A)."""
 
 
-def rules(cfg: LeggedConfig, runs: int, robot: Robot, gains: tuple[np.ndarray, np.ndarray]) -> list[tuple[str, Any]]:
-    """Return the overrides that make a task run under the league's rules, on its robot with the gains (D,) each."""
-    tables = (dict(zip(robot.joint_names, values.tolist(), strict=True)) for values in gains)
+def rules(cfg: LeggedConfig, course: Course, stage: str, gains: tuple[np.ndarray, np.ndarray]) -> list[tuple[str, Any]]:
+    """Return the overrides that make a task run a stage under the league's rules. `gains` (D,) each are the policy's."""
+    names, used = course.robot.joint_names, gains_of(stage, course.robot, gains)
+    tables = (dict(zip(names, values.tolist(), strict=True)) for values in used)
     return [
-        *undisturbed(cfg, runs, RUN_S),
-        ("robot", str(robot.folder)),
+        *undisturbed(cfg, len(course.points), RUN_S),
+        ("robot", str(course.robot.folder)),
         ("terrain.mesh_type", "plane"),
         *zip(("control.stiffness", "control.damping"), tables, strict=True),
         *((f"sim.{name}", value) for name, value in SOLVER.items()),
@@ -126,7 +127,7 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
             one of the league's rules.
         RunError: the file can't be written.
     """
-    start, cfg = time.perf_counter(), setting.cfg
+    cfg = setting.cfg
     _check_overrides(setting.asked)
     own = load_robot(cfg.robot)
     if own.folder != load_robot(OURS).folder:
@@ -135,19 +136,14 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
     if cfg.control.laws != {"P"}:
         raise ConfigError("POLICY: the league moves the arms by their angles, so all joints need control.control_type P")
     policy, ranges = replace(setting.policy, cfg=with_ideal_motors(setting.policy.cfg)), cfg.commands.ranges
-    limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
 
-    def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
-        gains = gains_of(stage, robot, control_gains(own, cfg.control))
-        changes = [*rules(cfg, len(runs), robot, gains), *setting.asked]
-        make = partial(make_league, Course.of(stage, runs, robot, limits))
-        task, actor = restore(policy, changes, setting.device, setting.graph, None, make)
+    def build(course: Course, stage: str) -> tuple[LeagueTask, Act]:
+        changes = [*rules(cfg, course, stage, control_gains(own, cfg.control)), *setting.asked]
+        task, actor = restore(policy, changes, setting.device, setting.graph, None, partial(make_league, course, stage))
         return task, lambda _, observations: actor(observations)
 
-    found = measure_stages(build, stages)
-    head = {**setting.head, **setting.changes, "wall_s": time.perf_counter() - start}
-    report({**head, **found}, list(runs), setting.folder / f"league_{setting.engine}.json")
-    return 0
+    limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
+    return _measure(build, runs, stages, limits, {**setting.head, **setting.changes}, setting.folder)
 
 
 def evaluate_foreign(
@@ -168,29 +164,22 @@ def evaluate_foreign(
             one of the league's rules.
         RunError: the file can't be written.
     """
-    start = time.perf_counter()
     _check_overrides(overrides)
     cfg = task_config(TASK, [("sim.physics", resolve_physics("auto", device)), *overrides])
     assert follows_velocities(cfg)
     if abs(layout.control_dt - CONTROL_DT) > 1e-9:
         raise ConfigError(f"layout: control_dt: must be {CONTROL_DT} in the league, got {layout.control_dt}")
-    limits = layout.contract.command_ranges if layout.contract is not None else np.array([(-1.0, 1.0)] * 3)
 
-    def build(stage: str, robot: Robot) -> tuple[LeagueTask, Act]:
-        foreign = ForeignPolicy(file, layout, robot)
-        gains = gains_of(stage, robot, (foreign.stiffness, foreign.damping))
-        targets = [("control.action_scale", 1.0), ("control.clip_actions", 1000.0)]
-        changes = nominal(cfg, [*rules(cfg, len(runs), robot, gains), *targets])
+    def build(course: Course, stage: str) -> tuple[LeagueTask, Act]:
+        foreign = ForeignPolicy(file, layout, course.robot)
+        changes = rules(cfg, course, stage, (foreign.stiffness, foreign.damping))
+        changes += [("control.action_scale", 1.0), ("control.clip_actions", 1000.0)]
         foreign.reset(len(runs))
-        task = make_league(Course.of(stage, runs, robot, limits), changes, device, graph, None)
-        return task, partial(_act, foreign)
+        return make_league(course, stage, nominal(cfg, changes), device, graph, None), partial(_act, foreign)
 
-    found = measure_stages(build, stages)
-    engine = engine_name(cfg.sim, device)
-    head = {"file": str(file), "physics": engine, "device": device_name(device), **changes_of(overrides)}
-    head["wall_s"] = time.perf_counter() - start
-    report({**head, **found}, list(runs), folder / f"league_{engine}.json")
-    return 0
+    limits = layout.contract.command_ranges if layout.contract is not None else np.array([(-1.0, 1.0)] * 3)
+    head = {"file": str(file), "physics": engine_name(cfg.sim, device), "device": device_name(device)}
+    return _measure(build, runs, stages, limits, {**head, **changes_of(overrides)}, folder)
 
 
 def _check_overrides(overrides: Sequence[tuple[str, Any]]) -> None:
@@ -206,32 +195,36 @@ def _act(foreign: ForeignPolicy, task: LeagueTask, _: TensorDict) -> Tensor:
     return torch.as_tensor(targets - task.robot.default_dof_pos, dtype=torch.float32)
 
 
-def measure_stages(build: Callable[[str, Robot], tuple[LeagueTask, Act]], stages: Sequence[str]) -> dict[str, Any]:
-    """Run the tours of each stage, and return stage -> scores under `stages`, and `contact_overflows`. `build` makes a task
-    and its policy for a stage, on the league's robot.
+def _measure(
+    build: Callable[[Course, str], tuple[LeagueTask, Act]],
+    runs: Sequence[int],
+    stages: Sequence[str],
+    limits: np.ndarray,
+    head: dict[str, Any],
+    folder: Path,
+) -> int:
+    """Run the tours of each stage, print the table of their scores, write it to league_<physics>.json in `folder`, and return
+    the exit code. `build` makes the task and the policy of a stage. `limits` (3, 2) are the lowest and the highest command.
+    `head` has the first fields of the file.
     """
-    found, lost = {}, 0
-    with tempfile.TemporaryDirectory() as folder:
-        robot = load_robot(str(write_robot(Path(folder))))
+    start, found, rows, lost = time.perf_counter(), {}, [], 0
+    with tempfile.TemporaryDirectory() as place:
+        course = Course.of(runs, load_robot(str(write_robot(Path(place)))), limits)
         for stage in stages:
-            task, act = build(stage, robot)
+            task, act = build(course, stage)
             lost += run_tours(task, act)
-            found[stage] = scores(task)
-            print(f"{stage}: {found[stage]['survival_s']:.1f} s", flush=True)
-    return {"stages": found, "contact_overflows": lost}
-
-
-def report(result: dict[str, Any], runs: Sequence[int], path: Path) -> None:
-    """Print the table of a result, and write the result to `path`."""
-    rows = []
-    for stage, found in result["stages"].items():
-        interval = "" if found["interval"] is None else "{:.1f} to {:.1f}".format(*found["interval"])
-        errors = (found["position_error_m"], found["yaw_error_rad"], found["energy_j"])
-        texts = ["-" if value is None else f"{value:.{digits}f}" for value, digits in zip(errors, (3, 2, 0), strict=True)]
-        rows.append([stage, f"{found['survival_s']:.1f}", interval, f"{100 * found['completed']:.0f} %", *texts])
+            found[stage] = score = scores(task)
+            print(f"{stage}: {score['survival_s']:.1f} s", flush=True)
+            interval = "" if score["interval"] is None else "{:.1f} to {:.1f}".format(*score["interval"])
+            errors = zip(("position_error_m", "yaw_error_rad", "energy_j"), (3, 2, 0), strict=True)
+            texts = ["-" if score[name] is None else f"{score[name]:.{digits}f}" for name, digits in errors]
+            rows.append([stage, f"{score['survival_s']:.1f}", interval, f"{100 * score['completed']:.0f} %", *texts])
     heads = ("stage", "survival [s]", "95 %", "completed", "position error [m]", "yaw error [rad]", "energy [J]")
-    name = f"{result.get('task', result.get('file'))} in {result['physics']}: {len(runs)} runs of {RUN_S:g} s"
+    name = f"{head.get('task', head.get('file'))} in {head['physics']}: {len(runs)} runs of {RUN_S:g} s"
     Console(width=120).print(screen_table(name, heads, rows))
-    warn_of_overflows("league", result["contact_overflows"])
+    warn_of_overflows("league", lost)
+    result = {**head, "wall_s": time.perf_counter() - start, "stages": found, "contact_overflows": lost}
+    path = folder / f"league_{head['physics']}.json"
     write_result(path, {**result, "first_run": runs[0], "definition": STAGES})
     print(f"written: {relative(path)}")
+    return 0

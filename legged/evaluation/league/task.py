@@ -44,27 +44,23 @@ PUNCH = (round(protocol.PUNCH_AT_S / CONTROL_DT), round((protocol.PUNCH_AT_S + p
 class Course:
     """What N runs ask of a robot; it is the same for all policies."""
 
-    stage: str
-    """Name in STAGES."""
+    robot: Robot
     points: np.ndarray
     """(N, POINTS, 3) waypoints."""
     goals: np.ndarray
-    """(N, 1 + goals, 7) angles of the left arm."""
+    """(N, 1 + goals, 7) angles of the left arm while the arms move."""
     punches: Sequence[protocol.Punches]
     """(N,) punches."""
     limits: np.ndarray
     """(3, 2) lowest and highest command of the policy [m/s, m/s, rad/s]."""
 
     @classmethod
-    def of(cls, stage: str, runs: Sequence[int], robot: Robot, limits: np.ndarray) -> "Course":
+    def of(cls, runs: Sequence[int], robot: Robot, limits: np.ndarray) -> "Course":
         """Return the course of the runs with the ids `runs`."""
         left = [robot.joint_names.index(f"left_{name}") for name in protocol.ARM_JOINTS]
+        goals = protocol.arm_goals(runs, *robot.dof_pos_limits[left].T)
         points = np.array([protocol.waypoints(run) for run in runs])
-        if stage in ("walking", "punches"):
-            goals = protocol.arm_goals(runs, *robot.dof_pos_limits[left].T)
-        else:
-            goals = np.tile(protocol.STANCE, (len(runs), 1 + POINTS * SLOT // GOAL, 1))
-        return cls(stage, points, goals, [protocol.punches(run, robot.num_dof) for run in runs], limits)
+        return cls(robot, points, goals, [protocol.punches(run, robot.num_dof) for run in runs], limits)
 
 
 def chains_of(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
@@ -81,10 +77,10 @@ def chains_of(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
     return np.array([[-1] * (longest - len(chain)) + chain for chain in chains])
 
 
-def make_league(course: Course, cfg: Any, device: torch.device, graph: bool, terrain: None) -> "LeagueTask":
-    """Build the task of `cfg` with a robot for each run of `course`."""
+def make_league(course: Course, stage: str, cfg: Any, device: torch.device, graph: bool, terrain: None) -> "LeagueTask":
+    """Build the task of `cfg` with a robot for each run of `course`, in the stage of this name in STAGES."""
     kind: Any = task_class(cfg.task)
-    own: Any = type(f"League{kind.__name__}", (LeagueTask, kind), {"course": course, "__module__": __name__})
+    own: Any = type(f"League{kind.__name__}", (LeagueTask, kind), {"course": course, "stage": stage, "__module__": __name__})
     return own(cfg, device, graph)  # type: ignore[no-any-return]
 
 
@@ -92,9 +88,10 @@ class LeagueTask(LeggedRobot):
     """A mix-in that lets each robot run its tour. The mix-in is the first base class, before the task's class."""
 
     course: Course
+    stage: str
 
     def pushed_by_forces(self) -> bool:
-        return self.course.stage == "punches"
+        return self.stage == "punches"
 
     def active_terminations(self) -> tuple[list[str], list[str]]:
         """Return no terminations, because a fall is a score here and does not begin a new episode."""
@@ -112,7 +109,8 @@ class LeagueTask(LeggedRobot):
         self._arms = tensor(arms, torch.long)
         held = [(column, arms.index(joint)) for column, joint in enumerate(self.control.held) if joint in arms]
         self._held, self._of_held = tensor(held, torch.long).view(-1, 2).unbind(dim=1)
-        self._goals = tensor(np.concatenate([course.goals, course.goals * protocol.MIRROR], axis=2))
+        left = course.goals[:, :1].repeat(course.goals.shape[1], axis=1) if self.stage == "held" else course.goals
+        self._goals = tensor(np.concatenate([left, left * protocol.MIRROR], axis=2))
         self._points, self._limits = tensor(course.points), tensor(course.limits)
         self._rows = torch.arange(n, device=torch.device(self.device))
         bodies = model.jnt_bodyid[[model.joint(name).id for name in names]]
@@ -153,7 +151,7 @@ class LeagueTask(LeggedRobot):
 
     def set_controls(self) -> None:
         super().set_controls()
-        if self.course.stage != "own":
+        if self.stage != "own":
             self.control.aim(self._arms, self._arm_targets())
 
     def _arm_targets(self) -> Tensor:
@@ -165,7 +163,7 @@ class LeagueTask(LeggedRobot):
 
     def apply_control(self) -> None:
         super().apply_control()
-        if self.course.stage == "punches":
+        if self.stage == "punches":
             self._punch()
 
     def _punch(self) -> None:
@@ -209,6 +207,6 @@ class LeagueTask(LeggedRobot):
         self.missed[self._rows, slot] = torch.where(walks.unsqueeze(1), missed, self.missed[self._rows, slot])
         self.command_sampler.hold(commands.clamp(self._limits[:, 0], self._limits[:, 1]))
         self.base_sampler.hold()
-        if self.course.stage != "own":  # a policy may observe the targets of held joints
+        if self.stage != "own":  # a policy may observe the targets of held joints
             targets = self._arm_targets() - self.default_dof_pos[self._arms]
             self.control.held_offsets.index_copy_(1, self._held, targets.index_select(1, self._of_held))

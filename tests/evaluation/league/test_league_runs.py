@@ -34,9 +34,9 @@ def robot(tmp_path: Path) -> Robot:
 
 def league_task(robot: Robot, stage: str, runs: int = 2, **changes) -> LeagueTask:
     cfg = with_ideal_motors(task_config("g1_flat", [("sim.physics", "mujoco"), *changes.items()]))
-    gains = gains_of(stage, robot, (robot.stiffness, robot.damping))
-    course = Course.of(stage, range(runs), robot, LIMITS)
-    return make_league(course, nominal(cfg, rules(cfg, runs, robot, gains)), torch.device("cpu"), False, None)
+    course = Course.of(range(runs), robot, LIMITS)
+    changes = rules(cfg, course, stage, (robot.stiffness, robot.damping))
+    return make_league(course, stage, nominal(cfg, changes), torch.device("cpu"), False, None)
 
 
 def zeros(task: LeagueTask) -> torch.Tensor:
