@@ -33,7 +33,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "evaluate episodes": ("legged.cli.evaluate:episodes", "returns and lengths of episodes, for tasks without commands"),
     "evaluate motions": ("legged.cli.evaluate:motions", "success and errors of a policy that tracks motions"),
     "evaluate gymnasium": ("legged.cli.evaluate:gymnasium", "returns in Gymnasium's own environment"),
-    "evaluate league": ("legged.cli.evaluate.league:league", "a G1 policy in the public walking league"),
+    "evaluate league": ("legged.cli.evaluate.league:league", "a policy of a G1 or an H1 in the public walking league"),
     "evaluate onnx": ("legged.cli.evaluate:onnx", "ONNX policies, foreign ones too, in plain MuJoCo"),
     "runs": ("legged.cli.runs:runs", "all runs in one table (the same as `runs table`)"),
     "runs table": ("legged.cli.runs:runs", "all runs in one table"),

@@ -1,4 +1,4 @@
-"""`legged evaluate league`: the public walking league for Unitree's G1."""
+"""`legged evaluate league`: the public walking league for Unitree's G1, and the same runs for an H1."""
 
 import argparse
 
@@ -28,7 +28,7 @@ RUNS = 64
     ),
 )
 def league(args: argparse.Namespace) -> int:
-    """Measure a G1 policy in the public walking league: `legged evaluate league g1_flat`.
+    """Measure a policy of a G1 or an H1 in the public walking league: `legged evaluate league g1_flat`.
 
     A run is a tour of 18 waypoints in 90 s. It ends when the robot falls. In the stage `own` the policy moves the arms, in
     `held` they are held, in `walking` they move at random, and in `punches` forces hit the robot besides. The last stage is

@@ -18,8 +18,8 @@ from legged.config import LeggedConfig, follows_velocities
 from legged.config.actuator import ActuatorConfig
 from legged.errors import ConfigError
 from legged.evaluation.intervals import bootstrap_mean, wilson
-from legged.evaluation.league.protocol import ARM_JOINTS, CONTROL_DT, POINTS, RUN_S
-from legged.evaluation.league.robot import OURS, servo_gains, write_robot
+from legged.evaluation.league.protocol import CONTROL_DT, POINTS, RUN_S
+from legged.evaluation.league.robot import HUMANOIDS, OURS, arms_of, check_robot, league_robot, servo_gains
 from legged.evaluation.league.task import SLOT, STAGES, Course, LeagueTask, make_league
 from legged.evaluation.measurement import Overflows, Setting, warn_of_overflows
 from legged.evaluation.result_file import changes_of, device_name, write_result
@@ -34,8 +34,6 @@ from legged.tables import screen_table
 
 MOST_RUNS = 2**16
 """Largest number of runs of a stage."""
-TASK = "g1_flat"
-"""Task in which ONNX policies run. Only its robot matters for them."""
 SOLVER = {"dt": 0.002, "impratio": 1.0, "iterations": 100, "ls_iterations": 50, "nconmax": 64, "njmax": 320}
 """Settings of the section `sim`: MuJoCo's defaults, and memory for a robot that lies on the ground."""
 FIXED = (
@@ -71,8 +69,10 @@ def with_ideal_motors(cfg: LeggedConfig) -> LeggedConfig:
 
 
 def gains_of(stage: str, robot: Robot, own: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gains (D,) of a stage: the policy's, `own`. In all stages except `own`, the arms have the league's gains."""
-    arms = np.array([name.endswith(ARM_JOINTS) for name in robot.joint_names]) & (stage != "own")
+    """Return the gains (D,) of a stage: the policy's, `own`. In all stages except `own`, the G1's arms have the league's."""
+    if stage == "own" or not HUMANOIDS[robot.name].is_the_leagues:
+        return own
+    arms = np.isin(np.arange(robot.num_dof), arms_of(robot))
     stiffness, damping = (np.where(arms, league, given) for league, given in zip(servo_gains(robot), own, strict=True))
     return stiffness, damping
 
@@ -123,15 +123,14 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
     league_<physics>.json, and return the exit code.
 
     Raises:
-        ConfigError: the policy's robot is not the G1 of this package, its joints have another law than P, or an override is
+        ConfigError: the policy's robot is not this package's G1 or H1, its joints have another law than P, or an override is
             one of the league's rules.
         RunError: the file can't be written.
     """
     cfg = setting.cfg
     _check_overrides(setting.asked)
     own = load_robot(cfg.robot)
-    if own.folder != load_robot(OURS).folder:
-        raise ConfigError(f"POLICY: the league's robot is '{OURS}', but '{setting.policy.cfg.task}' has '{own.name}'")
+    check_robot(own, setting.policy.cfg.task)
     assert follows_velocities(setting.policy.cfg)
     if cfg.control.laws != {"P"}:
         raise ConfigError("POLICY: the league moves the arms by their angles, so all joints need control.control_type P")
@@ -143,7 +142,7 @@ def evaluate_league(setting: Setting, runs: Sequence[int], stages: Sequence[str]
         return task, lambda _, observations: actor(observations)
 
     limits = np.array([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw])
-    return _measure(build, runs, stages, limits, {**setting.head, **setting.changes}, setting.folder)
+    return _measure(build, own.name, runs, stages, limits, {**setting.head, **setting.changes}, setting.folder)
 
 
 def evaluate_foreign(
@@ -165,7 +164,10 @@ def evaluate_foreign(
         RunError: the file can't be written.
     """
     _check_overrides(overrides)
-    cfg = task_config(TASK, [("sim.physics", resolve_physics("auto", device)), *overrides])
+    robot = OURS if layout.contract is None else layout.contract.robot
+    if robot not in HUMANOIDS:
+        raise ConfigError(f"POLICY: the league measures {' and '.join(HUMANOIDS)}, but {file} is for '{robot}'")
+    cfg = task_config(f"{robot}_flat", [("sim.physics", resolve_physics("auto", device)), *overrides])
     assert follows_velocities(cfg)
     if abs(layout.control_dt - CONTROL_DT) > 1e-9:
         raise ConfigError(f"layout: control_dt: must be {CONTROL_DT} in the league, got {layout.control_dt}")
@@ -179,7 +181,7 @@ def evaluate_foreign(
 
     limits = layout.contract.command_ranges if layout.contract is not None else np.array([(-1.0, 1.0)] * 3)
     head = {"file": str(file), "physics": engine_name(cfg.sim, device), "device": device_name(device)}
-    return _measure(build, runs, stages, limits, {**head, **changes_of(overrides)}, folder)
+    return _measure(build, robot, runs, stages, limits, {**head, **changes_of(overrides)}, folder)
 
 
 def _check_overrides(overrides: Sequence[tuple[str, Any]]) -> None:
@@ -197,19 +199,20 @@ def _act(foreign: ForeignPolicy, task: LeagueTask, _: TensorDict) -> Tensor:
 
 def _measure(
     build: Callable[[Course, str], tuple[LeagueTask, Act]],
+    robot: str,
     runs: Sequence[int],
     stages: Sequence[str],
     limits: np.ndarray,
     head: dict[str, Any],
     folder: Path,
 ) -> int:
-    """Run the tours of each stage, print the table of their scores, write it to league_<physics>.json in `folder`, and return
-    the exit code. `build` makes the task and the policy of a stage. `limits` (3, 2) are the lowest and the highest command.
-    `head` has the first fields of the file.
+    """Run the tours of `robot` in each stage, print the table of their scores, write it to league_<physics>.json in `folder`,
+    and return the exit code. `build` makes the task and the policy of a stage. `limits` (3, 2) are the lowest and the highest
+    command. `head` has the first fields of the file.
     """
     start, found, rows, lost = time.perf_counter(), {}, [], 0
     with tempfile.TemporaryDirectory() as place:
-        course = Course.of(runs, load_robot(str(write_robot(Path(place)))), limits)
+        course = Course.of(runs, league_robot(robot, Path(place)), limits)
         for stage in stages:
             task, act = build(course, stage)
             lost += run_tours(task, act)

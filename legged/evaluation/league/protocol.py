@@ -26,35 +26,29 @@ STRONGEST, WEAKEST_SHARE, FIRST_SHARE, CLIMB_S = 500.0, 0.5, 1.0 / 3.0, 60.0
 of STRONGEST to STRONGEST within CLIMB_S [s]."""
 PUNCH_AT_S, PUNCH_S = 0.1, 0.08
 """Time from the beginning of a waypoint's slot to the punch, and duration of the punch [s]."""
-ARM_JOINTS = tuple(f"{part}_joint" for part in ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")) + tuple(
-    f"wrist_{part}_joint" for part in ("roll", "pitch", "yaw")
-)
-"""Joints of an arm, without the side in front of their names."""
-MIRROR = np.array([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-"""Sign of each joint of the right arm in the mirror image of the left arm."""
-STANCE = np.array([0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0])
-"""Angles of the left arm at the start [rad]."""
 GOAL_S = 0.5
 """Time from one goal of the arms to the next [s]."""
 WANDER, WANDER_STEPS = 0.06, 25
 """A goal is WANDER_STEPS uniform steps of at most WANDER [rad] away from the last one."""
 TRIES = 8
 """Number of goals that are tried until the hands are in front of the body. After that the arms stay."""
-ARM_LINKS = (  # of `g1_29dof.xml` in unitree_mujoco; this package's G1 has the same arm to within 3e-4 rad
-    ((0.0039563, 0.10022, 0.23778), (0.990264, 0.139201, 1.38722e-05, -9.86868e-05), (0.0, 1.0, 0.0)),
-    ((0.0, 0.038, -0.013831), (0.990268, -0.139172, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.0, 0.00624, -0.1032), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    ((0.015783, 0.0, -0.080518), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.1, 0.00188791, -0.01), (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
-    ((0.038, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.046, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-)
-"""Links of the league's left arm: position [m] and orientation (w, x, y, z) in the frame of the link before, and the joint's
-axis."""
-HAND = np.array([(x, y, z) for x in (0.0, 0.13182935) for y in (-0.04790606, 0.01865148) for z in (-0.0430289, 0.0634499)])
-"""Corners of the left rubber hand's box, where the league puts it in the frame of the last link [m]."""
-HEAD = 0.32479587 - 0.054
-"""Height of the lower end of the head's mesh in the frame of the league's torso [m]."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A left arm with K joints. The right arm is its mirror image."""
+
+    stance: np.ndarray
+    """(K,) angles at the start [rad]."""
+    limits: np.ndarray
+    """(K, 2) lowest and highest angles [rad]."""
+    links: Sequence[tuple[Sequence[float], Sequence[float], Sequence[float]]]
+    """(K,) position [m] and orientation (w, x, y, z) of each link in the frame of the link before, first the torso, and the
+    joint's axis."""
+    hand: np.ndarray
+    """(C, 3) points of the hand in the frame of the last link [m]."""
+    head: float
+    """Height of the lower end of the head in the frame of the torso [m]."""
 
 
 @dataclass(frozen=True)
@@ -93,40 +87,40 @@ def punches(run: int, joints: int) -> Punches:
     return Punches(*(np.array(values) for values in zip(*found, strict=True)))
 
 
-def reach(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far back and how far up the left hand reaches at arm angles (K, 7) [rad], (K,) each: smallest x and largest
-    z of its box in the frame of the torso [m]. The right arm is the mirror image, so its hand reaches as far.
+def reach(arm: Arm, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far back and how far up the left hand reaches at arm angles (M, K) [rad], (M,) each: smallest x and largest
+    z of its points in the frame of the torso [m]. The right arm is the mirror image, so its hand reaches as far.
     """
     given = torch.from_numpy(angles)
     place, turn = torch.zeros(len(given), 3, dtype=torch.float64), torch.zeros(len(given), 4, dtype=torch.float64)
     turn[:, 0] = 1.0
-    for angle, link in zip(given.T, ARM_LINKS, strict=True):
-        arm, own, axis = (torch.tensor(numbers, dtype=torch.float64) for numbers in link)
-        place = place + quat_rotate(turn, arm.expand_as(place))
+    for angle, link in zip(given.T, arm.links, strict=True):
+        shift, own, axis = (torch.tensor(numbers, dtype=torch.float64) for numbers in link)
+        place = place + quat_rotate(turn, shift.expand_as(place))
         turn = quat_multiply(quat_multiply(turn, own.expand_as(turn)), quat_from_angle_axis(angle, axis))
-    corners = torch.from_numpy(HAND).expand(len(given), -1, -1)
-    reached = place.unsqueeze(1) + quat_rotate(turn.unsqueeze(1).expand(-1, len(HAND), -1), corners)
+    points = torch.from_numpy(arm.hand).expand(len(given), -1, -1)
+    reached = place.unsqueeze(1) + quat_rotate(turn.unsqueeze(1).expand(-1, len(arm.hand), -1), points)
     return reached[..., 0].amin(dim=1).numpy(), reached[..., 2].amax(dim=1).numpy()
 
 
-def arm_goals(runs: Sequence[int], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the angles of the left arm at the start and at the end of each GOAL_S, (N, 1 + goals, 7) [rad], for the N runs
-    with the ids `runs`. Between the ends, the angles change linearly. `low` and `high` (7,) are the limits of the joints.
+def arm_goals(runs: Sequence[int], arm: Arm) -> np.ndarray:
+    """Return the angles of the left arm at the start and at the end of each GOAL_S, (N, 1 + goals, K) [rad], for the N runs
+    with the ids `runs`. Between the ends, the angles change linearly.
 
     At every goal both hands are no further back than at the start, and below the head.
     """
-    streams, (furthest_back, _) = [Stream(run, ARMS) for run in runs], reach(STANCE[None])
-    goals = np.tile(STANCE, (len(runs), 1 + round(RUN_S / GOAL_S), 1))
+    streams, (furthest_back, _) = [Stream(run, ARMS) for run in runs], reach(arm, arm.stance[None])
+    goals = np.tile(arm.stance, (len(runs), 1 + round(RUN_S / GOAL_S), 1))
     for k in range(1, goals.shape[1]):
         goals[:, k] = goals[:, k - 1]
         waiting = np.arange(len(runs))
         for _ in range(TRIES):
-            steps = [streams[i].units(WANDER_STEPS * len(STANCE)).reshape(WANDER_STEPS, -1) for i in waiting]
+            steps = [streams[i].units(WANDER_STEPS * len(arm.stance)).reshape(WANDER_STEPS, -1) for i in waiting]
             tried = goals[waiting, k - 1]
             for step in np.moveaxis(np.array(steps), 1, 0):
-                tried = np.clip(tried + WANDER * (2.0 * step - 1.0), low, high)
-            back, up = reach(tried)
-            allowed = (back >= furthest_back) & (up <= HEAD)
+                tried = np.clip(tried + WANDER * (2.0 * step - 1.0), *arm.limits.T)
+            back, up = reach(arm, tried)
+            allowed = (back >= furthest_back) & (up <= arm.head)
             goals[waiting[allowed], k] = tried[allowed]
             waiting = waiting[~allowed]
             if not len(waiting):
@@ -135,7 +129,7 @@ def arm_goals(runs: Sequence[int], low: np.ndarray, high: np.ndarray) -> np.ndar
 
 
 def league_frames(model: mujoco.MjModel) -> np.ndarray:
-    """Return the orientations (bodies, 4) of the league's link frames in those of this package's G1, (w, x, y, z).
+    """Return the orientations (bodies, 4) of the league's link frames in those of this package's robots, (w, x, y, z).
 
     Here all frames are parallel to the base's at zero angles. In the league, each joint turns about a coordinate axis of its
     link, and frames of leaning joints lean with them.

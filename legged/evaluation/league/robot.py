@@ -1,16 +1,20 @@
-"""The league's robot: this package's G1 with the masses, motors and feet of the league's model."""
+"""Robots in the league: this package's G1 with the masses, motors and feet of the league's model, and other humanoids."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from legged.errors import ConfigError
+from legged.evaluation.league.protocol import Arm
 from legged.robots.importing.convert import robot_spec_of
 from legged.robots.robot import Robot, load_robot
 
 OURS = "g1"
-"""Name of the robot from which the league's robot is made."""
+"""Name of the robot from which the league's own robot is made."""
 BODIES = {  # numbers of `g1_29dof.xml` in unitree_mujoco
     "waist_yaw_link": (
         *(0.244, (0.003964, 0.0, 0.018769), (-0.0178291, 0.628464, 0.0282471, 0.777121)),
@@ -52,13 +56,89 @@ SOLE = ((-0.05, 0.025), (-0.05, -0.025), (0.12, 0.03), (0.12, -0.03))
 """Places of a foot's spheres, x and y in the frame of the ankle [m]. They are 0.03 m below it."""
 RADIUS = 0.005
 """Radius of these spheres [m]."""
+CRANE_HEIGHT = 0.793
+"""Height of the pelvis at which the league's crane lets go of the robot [m]."""
 PULSE = 2.0 * np.pi * 10.0
 """Angular frequency of the league's own servos with the motor's inertia alone [rad/s]."""
+ARM_LINKS = (  # of `g1_29dof.xml` in unitree_mujoco; this package's G1 has the same arm to within 3e-4 rad
+    ((0.0039563, 0.10022, 0.23778), (0.990264, 0.139201, 1.38722e-05, -9.86868e-05), (0.0, 1.0, 0.0)),
+    ((0.0, 0.038, -0.013831), (0.990268, -0.139172, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.0, 0.00624, -0.1032), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.015783, 0.0, -0.080518), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.1, 0.00188791, -0.01), (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0)),
+    ((0.038, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.046, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+)
+"""Links of the league's left arm, as in `Arm`."""
+HAND = np.array([(x, y, z) for x in (0.0, 0.13182935) for y in (-0.04790606, 0.01865148) for z in (-0.0430289, 0.0634499)])
+"""Corners of the left rubber hand's box, where the league puts it in the frame of the last link [m]."""
+HEAD = 0.32479587 - 0.054
+"""Height of the lower end of the head's mesh in the frame of the league's torso [m]."""
+
+
+@dataclass(frozen=True)
+class Humanoid:
+    """What differs between the robots that the league's runs are for."""
+
+    hand: Any
+    """(C, 3) points of the left hand in the frame of the arm's last link [m]."""
+    head: float
+    """Height of the lower end of the head in the frame of the torso [m]."""
+    arm_links: Any = None
+    """Links of the left arm, as in `Arm`. None: those of the robot's model."""
+    height: float | None = None
+    """Height of the base at the start [m]. None: the robot's spawn height. The joints are at rest at the default angles."""
+    is_the_leagues: bool = False
+    """True: the model and the gains of held arms are the league's. False: they are the robot's and the policy's."""
+
+
+HUMANOIDS = {
+    OURS: Humanoid(HAND, HEAD, ARM_LINKS, CRANE_HEIGHT, is_the_leagues=True),
+    "h1": Humanoid(hand=((0.31, 0.0, -0.0166),), head=0.56),  # the end of the forearm's capsule
+}
+"""Name of a robot -> what is its own in the league."""
+ARM_PARTS = ("shoulder", "elbow", "wrist")
+"""Parts of the names of the arms' joints."""
+
+
+def league_robot(name: str, parent: Path) -> Robot:
+    """Return the robot of this name in HUMANOIDS, as the league's runs simulate it. Its files may be in `parent`."""
+    return load_robot(str(write_robot(parent)) if HUMANOIDS[name].is_the_leagues else name)
+
+
+def check_robot(robot: Robot, task: str) -> None:
+    """Check that the league has runs for the robot of `task`.
+
+    Raises:
+        ConfigError: the robot is not in HUMANOIDS, or not this package's.
+    """
+    if robot.name not in HUMANOIDS or robot.folder != load_robot(robot.name).folder:
+        known = " and ".join(f"'{name}'" for name in HUMANOIDS)
+        raise ConfigError(f"POLICY: the league measures this package's {known}, but '{task}' has '{robot.name}'")
+
+
+def arms_of(robot: Robot) -> tuple[list[int], list[int]]:
+    """Return the indices of the joints of the left arm, and of their partners in the right arm."""
+    assert robot.mirror is not None
+    names = enumerate(robot.joint_names)
+    left = [i for i, name in names if name.startswith("left") and any(part in name for part in ARM_PARTS)]
+    return left, [robot.mirror.joints[i] for i in left]
+
+
+def arm_of(robot: Robot) -> Arm:
+    """Return the left arm of a robot."""
+    own, (left, _) = HUMANOIDS[robot.name], arms_of(robot)
+    links = own.arm_links
+    if links is None:
+        model = robot_spec_of(robot.model_path).compile()
+        joints = [model.joint(robot.joint_names[i]) for i in left]
+        links = [(model.body_pos[body], model.body_quat[body], joint.axis) for joint in joints for body in joint.bodyid]
+    return Arm(robot.default_dof_pos[left], robot.dof_pos_limits[left], links, np.array(own.hand), own.head)
 
 
 def write_robot(parent: Path) -> Path:
     """Write the league's robot to a new folder in `parent`, and return the folder. `load_robot` reads it."""
-    folder = parent / f"{OURS}_league"
+    folder = parent / OURS
     folder.mkdir()
     ours = load_robot(OURS)
     copyfile(ours.folder / "robot.yaml", folder / "robot.yaml")

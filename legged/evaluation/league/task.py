@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from legged.envs import LeggedRobot
 from legged.evaluation.league import protocol
 from legged.evaluation.league.protocol import CONTROL_DT, GOAL_S, POINT_S, POINTS
+from legged.evaluation.league.robot import HUMANOIDS, arm_of, arms_of
 from legged.math import quat_multiply, quat_rotate, yaw_of
 from legged.mdp.waypoints import approach
 from legged.registry import task_class
@@ -28,8 +29,6 @@ STAGES = {
 """Stage of the ladder -> what happens in it."""
 FALLEN = 0.2
 """Height of the pelvis below which a run ends [m]."""
-CRANE_HEIGHT = 0.793
-"""Height of the pelvis at which a crane lets go of the robot [m]. The joints are then at rest at the default angles."""
 GAIN = 1.5
 """Command per distance to the waypoint and per error of the yaw [1/s]."""
 REACHED, LEFT = (0.10, 0.05), (0.20, 0.12)
@@ -45,10 +44,14 @@ class Course:
     """What N runs ask of a robot; it is the same for all policies."""
 
     robot: Robot
+    arms: Sequence[int]
+    """(2 K,) indices of the joints of the left and the right arm."""
+    height: float
+    """Height of the base at the start [m]."""
     points: np.ndarray
     """(N, POINTS, 3) waypoints."""
     goals: np.ndarray
-    """(N, 1 + goals, 7) angles of the left arm while the arms move."""
+    """(N, 1 + goals, 2 K) angles of the arms while they move."""
     punches: Sequence[protocol.Punches]
     """(N,) punches."""
     limits: np.ndarray
@@ -57,10 +60,13 @@ class Course:
     @classmethod
     def of(cls, runs: Sequence[int], robot: Robot, limits: np.ndarray) -> "Course":
         """Return the course of the runs with the ids `runs`."""
-        left = [robot.joint_names.index(f"left_{name}") for name in protocol.ARM_JOINTS]
-        goals = protocol.arm_goals(runs, *robot.dof_pos_limits[left].T)
+        assert robot.mirror is not None
+        (left, right), height = arms_of(robot), HUMANOIDS[robot.name].height or robot.file.spawn_height
+        goals = protocol.arm_goals(runs, arm_of(robot))
+        both = np.concatenate([goals, goals * np.array(robot.mirror.signs)[left]], axis=2)
         points = np.array([protocol.waypoints(run) for run in runs])
-        return cls(robot, points, goals, [protocol.punches(run, robot.num_dof) for run in runs], limits)
+        punches = [protocol.punches(run, robot.num_dof) for run in runs]
+        return cls(robot, [*left, *right], height, points, both, punches, limits)
 
 
 def chains_of(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
@@ -105,12 +111,11 @@ class LeagueTask(LeggedRobot):
             return torch.as_tensor(np.array(values), dtype=dtype, device=torch.device(self.device))
 
         names = self.robot.joint_names
-        arms = [names.index(f"{side}_{name}") for side in ("left", "right") for name in protocol.ARM_JOINTS]
-        self._arms = tensor(arms, torch.long)
-        held = [(column, arms.index(joint)) for column, joint in enumerate(self.control.held) if joint in arms]
+        self._arms = tensor(course.arms, torch.long)
+        held = [(column, course.arms.index(joint)) for column, joint in enumerate(self.control.held) if joint in course.arms]
         self._held, self._of_held = tensor(held, torch.long).view(-1, 2).unbind(dim=1)
-        left = course.goals[:, :1].repeat(course.goals.shape[1], axis=1) if self.stage == "held" else course.goals
-        self._goals = tensor(np.concatenate([left, left * protocol.MIRROR], axis=2))
+        goals = course.goals
+        self._goals = tensor(goals[:, :1].repeat(goals.shape[1], axis=1) if self.stage == "held" else goals)
         self._points, self._limits = tensor(course.points), tensor(course.limits)
         self._rows = torch.arange(n, device=torch.device(self.device))
         bodies = model.jnt_bodyid[[model.joint(name).id for name in names]]
@@ -143,7 +148,7 @@ class LeagueTask(LeggedRobot):
 
     def place(self) -> None:
         self.reset_qpos[:, :2].zero_()
-        self.reset_qpos[:, 2].fill_(CRANE_HEIGHT)
+        self.reset_qpos[:, 2].fill_(self.course.height)
         self.reset_qpos[:, 3].fill_(1.0)
         self.reset_qpos[:, 4:7].zero_()
         self.reset_qpos[:, 7:].copy_(self.default_dof_pos.expand(self.num_envs, -1))
@@ -155,7 +160,7 @@ class LeagueTask(LeggedRobot):
             self.control.aim(self._arms, self._arm_targets())
 
     def _arm_targets(self) -> Tensor:
-        """Return the targets of the left and the right arm in the next control step, (N, 14) [rad]."""
+        """Return the targets of the left and the right arm in the next control step, (N, 2 K) [rad]."""
         step = self.episode_length_buf.clamp(max=POINTS * SLOT - 1)
         goal, share = step // GOAL, ((step % GOAL + 1) / GOAL * (step > 0)).unsqueeze(1)  # still at the first step
         last = self._goals[self._rows, goal]

@@ -6,24 +6,30 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged.evaluation.league import protocol
-from legged.evaluation.league.protocol import HEAD, MIRROR, STANCE, arm_goals, punches, reach, waypoints
-from legged.evaluation.league.robot import servo_gains, write_robot
+from legged.evaluation.league.protocol import Arm, arm_goals, league_frames, punches, reach, waypoints
+from legged.evaluation.league.robot import HEAD, arm_of, arms_of, league_robot, servo_gains
 from legged.evaluation.league.streams import Stream, spread
 from legged.robots.robot import Robot, load_robot
+
+STANCE = np.array([0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0])
+"""Angles of the G1's left arm at the start."""
 
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     """The league's robot."""
-    return load_robot(str(write_robot(tmp_path_factory.mktemp("robot"))))
+    return league_robot("g1", tmp_path_factory.mktemp("robot"))
 
 
 @pytest.fixture(scope="module")
-def goals(robot: Robot) -> np.ndarray:
+def arm(robot: Robot) -> Arm:
+    return arm_of(robot)
+
+
+@pytest.fixture(scope="module")
+def goals(arm: Arm) -> np.ndarray:
     """Goals of the left arm in the runs 0 to 3."""
-    left = [robot.joint_names.index(f"left_{name}") for name in protocol.ARM_JOINTS]
-    return arm_goals(range(4), *robot.dof_pos_limits[left].T)
+    return arm_goals(range(4), arm)
 
 
 def test_the_streams_of_a_run_differ_and_repeat():
@@ -84,30 +90,60 @@ def test_arms_are_those_of_the_league(goals):
     assert after[1] == pytest.approx([-0.0906, 0.3764, -0.1810, 1.0628, -0.2044, -0.5872, 0.0080], abs=5e-5)
 
 
-def test_hands_stay_in_front_of_the_body_and_below_the_head(goals):
-    back, up = reach(goals.reshape(-1, 7))
-    assert back.min() >= reach(STANCE[None])[0][0]
+def test_hands_stay_in_front_of_the_body_and_below_the_head(arm, goals):
+    back, up = reach(arm, goals.reshape(-1, 7))
+    assert back.min() >= reach(arm, STANCE[None])[0][0]
     assert up.max() <= HEAD
     assert np.abs(np.diff(goals, axis=1)).max() <= 25 * 0.06
 
 
-def test_the_arm_of_the_check_is_the_robots(robot, goals):
-    """The hand's box as C MuJoCo places it, on both sides of the robot."""
-    model = mujoco.MjModel.from_xml_path(str(robot.model_path))
-    data = mujoco.MjData(model)
-    angles = goals[:, ::20].reshape(-1, 7)
-    back, up = reach(angles)
+def test_arms_of_an_h1_move_within_its_limits_and_in_front_of_it():
+    robot = load_robot("h1")
+    left, right = arms_of(robot)
+    assert [robot.joint_names[i].removeprefix("left_") for i in left] == [
+        *("shoulder_pitch_joint", "shoulder_roll_joint", "shoulder_yaw_joint", "elbow_joint")
+    ]
+    assert [robot.joint_names[i] for i in right] == [robot.joint_names[i].replace("left", "right") for i in left]
+    arm = arm_of(robot)
+    goals = arm_goals(range(4), arm)
+    assert goals.shape == (4, 181, 4)
+    assert (goals[:, 0] == 0.0).all()
+    assert (goals >= robot.dof_pos_limits[left, 0]).all()
+    assert (goals <= robot.dof_pos_limits[left, 1]).all()
+    assert goals[:, 20:].std(axis=(0, 1)).min() > 0.3  # they do move
+    back, up = reach(arm, goals.reshape(-1, 4))
+    assert back.min() >= 0.0185 + 0.31  # the forearm points forward at the start
+    assert up.max() <= 0.64 - 0.08
+
+
+@pytest.mark.parametrize("name", ["g1", "h1"])
+def test_the_arm_of_the_check_is_the_robots(name, tmp_path):
+    """The hand as C MuJoCo places it, on both sides of the robot."""
+    robot = league_robot(name, tmp_path)
+    model, arm, arms = mujoco.MjModel.from_xml_path(str(robot.model_path)), arm_of(robot), arms_of(robot)
+    data, signs = mujoco.MjData(model), np.array(robot.mirror.signs)[arms[0]]
+    angles = arm_goals(range(4), arm)[:, ::20].reshape(-1, len(arm.stance))
+    back, up = reach(arm, angles)
     for i, left in enumerate(angles):
-        for side, own in (("left", left), ("right", MIRROR * left)):
-            data.qpos[[model.joint(f"{side}_{name}").qposadr[0] for name in protocol.ARM_JOINTS]] = own
+        for joints, own in zip(arms, (left, signs * left), strict=True):
+            data.qpos[[robot.qpos_columns[joint] for joint in joints]] = own
         mujoco.mj_kinematics(model, data)
         torso = data.body("torso_link")
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            hand = data.body(f"{side}_wrist_yaw_link")
-            corners = hand.xpos + protocol.HAND * (1.0, sign, 1.0) @ hand.xmat.reshape(3, 3).T
+        for joints, sign in zip(arms, (1.0, -1.0), strict=True):
+            hand = data.body(int(model.joint(robot.joint_names[joints[-1]]).bodyid[0]))
+            corners = hand.xpos + arm.hand * (1.0, sign, 1.0) @ hand.xmat.reshape(3, 3).T
             seen = (corners - torso.xpos) @ torso.xmat.reshape(3, 3)
             assert seen[:, 0].min() == pytest.approx(back[i], abs=1e-3)
             assert seen[:, 2].max() == pytest.approx(up[i], abs=1e-3)
+
+
+def test_the_hand_of_an_h1_is_the_end_of_its_forearm():
+    model = mujoco.MjModel.from_xml_path(str(load_robot("h1").model_path))
+    forearm = model.geom("left_forearm")
+    axis = np.zeros(3)
+    mujoco.mju_rotVecQuat(axis, np.array([0.0, 0.0, 1.0]), forearm.quat)
+    ends = [forearm.pos + sign * (forearm.size[0] + forearm.size[1]) * axis for sign in (-1.0, 1.0)]
+    assert arm_of(load_robot("h1")).hand[0] == pytest.approx(max(ends, key=lambda end: end[0]), abs=1e-3)
 
 
 def test_the_robot_is_the_leagues(robot):
@@ -134,7 +170,7 @@ def test_the_robot_is_the_leagues(robot):
 
 def test_frames_of_the_league_lean_with_their_joints(robot):
     model = mujoco.MjModel.from_xml_path(str(robot.model_path))
-    frames = protocol.league_frames(model)
+    frames = league_frames(model)
     for name, quat in (  # of `g1_29dof.xml`; the frames of shoulder and hip roll follow that of the body
         ("left_hip_roll_link", (0.996179, 0.0, -0.0873386, 0.0)),
         ("right_shoulder_pitch_link", (0.990264, -0.139201, 0.0, 0.0)),

@@ -13,9 +13,9 @@ from onnx import TensorProto, helper, numpy_helper
 
 from legged.cli.main import main
 from legged.evaluation.league.measuring import gains_of, rules, run_tours, scores, with_ideal_motors
-from legged.evaluation.league.protocol import MIRROR, STANCE, league_frames, punches
-from legged.evaluation.league.robot import servo_gains, write_robot
-from legged.evaluation.league.task import Course, LeagueTask, make_league
+from legged.evaluation.league.protocol import league_frames, punches
+from legged.evaluation.league.robot import league_robot, servo_gains
+from legged.evaluation.league.task import STAGES, Course, LeagueTask, make_league
 from legged.policies.foreign import ForeignPolicy, Layout
 from legged.policies.restore import nominal
 from legged.registry import task_config
@@ -24,16 +24,18 @@ from legged.robots.robot import Robot, load_robot
 pytestmark = pytest.mark.usefixtures("workplace")
 LIMITS = np.array([(-0.5, 1.0), (-0.3, 0.3), (-1.0, 1.0)])
 HELD = ("shoulder", "elbow", "wrist")
+STANCE, MIRROR = np.array([0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0]), np.array([1.0, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+"""Angles of the G1's left arm at the start, and signs of the right arm's angles."""
 
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Robot:
     """The league's robot."""
-    return load_robot(str(write_robot(tmp_path)))
+    return league_robot("g1", tmp_path)
 
 
-def league_task(robot: Robot, stage: str, runs: int = 2, **changes) -> LeagueTask:
-    cfg = with_ideal_motors(task_config("g1_flat", [("sim.physics", "mujoco"), *changes.items()]))
+def league_task(robot: Robot, stage: str, runs: int = 2, task: str = "g1_flat", **changes) -> LeagueTask:
+    cfg = with_ideal_motors(task_config(task, [("sim.physics", "mujoco"), *changes.items()]))
     course = Course.of(range(runs), robot, LIMITS)
     changes = rules(cfg, course, stage, (robot.stiffness, robot.damping))
     return make_league(course, stage, nominal(cfg, changes), torch.device("cpu"), False, None)
@@ -123,6 +125,24 @@ def test_a_policy_that_does_not_move_the_arms_may_observe_their_targets(robot):
     assert task._obs_held_targets()[0, :7].numpy() == pytest.approx(expected - robot.default_dof_pos[15:22], abs=5e-5)
     task.step(zeros(task))
     assert not league_task(robot, "own", **changes)._obs_held_targets().any()
+
+
+@pytest.mark.parametrize("name", ["h1_teleop", "h1_flat", "h1_real"])
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_h1_runs_every_stage(name, stage):
+    robot = load_robot("h1")
+    task = league_task(robot, stage, task=name)
+    assert task.physics.qpos[1].tolist() == pytest.approx([0.0, 0.0, 1.08, 1.0, 0.0, 0.0, 0.0, *robot.default_dof_pos])
+    own = robot.stiffness + 1.0, robot.damping + 1.0
+    assert gains_of(stage, robot, own) == own  # no gains are the league's
+    assert (task.physics.forces is not None) == (stage == "punches")
+    for _ in range(30):
+        task.step(zeros(task))
+    assert task.alive.all()
+    assert task.base_pos[:, 2].min() > 0.8
+    targets, moves = task.control._target[:, robot.joint_names.index("left_elbow_joint")], stage in ("walking", "punches")
+    assert (targets.abs().min() > 1e-3) == moves
+    assert targets.unique().numel() == (2 if moves else 1)
 
 
 def test_height_and_pitch_are_the_usual_ones(robot):
@@ -249,7 +269,7 @@ def test_an_onnx_policy_is_measured_on_the_command_line(capsys):
         (["g1_flat", "--stages", "own,punch"], "--stages: there is no stage 'punch'; did you mean 'punches'?"),
         (["g1_flat", "--runs", "0"], "--runs"),
         (["g1_flat", "--layout", "holosoma"], "--layout: has no effect on a policy that is not an ONNX file"),
-        (["go1_flat"], "POLICY: the league's robot is 'g1', but 'go1_flat' has 'go1'"),
+        (["go1_flat"], "POLICY: the league measures this package's 'g1' and 'h1', but 'go1_flat' has 'go1'"),
         (["g1_flat", "control.decimation=4"], "control.decimation: cannot be changed, because the league's rules set it"),
         (["g1_flat", "domain_rand.forces.pull.x=[1,2]"], "domain_rand.forces.pull.x: cannot be changed"),
         (["none.onnx"], "there is no ONNX file"),
