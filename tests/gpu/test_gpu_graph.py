@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from devices import CUDA
@@ -13,7 +14,11 @@ from helpers import CALM, TASK
 from legged.config import TaskConfig
 from legged.envs import LeggedRobot
 from legged.errors import TermError
+from legged.evaluation.league.measuring import rules, with_ideal_motors
+from legged.evaluation.league.robot import league_robot
+from legged.evaluation.league.task import Course, make_league
 from legged.graph.step_graph import Branch, ForbidHostReads, HostReadError, StepGraph
+from legged.policies.restore import nominal
 from legged.registry import make_task, task_config
 
 pytestmark = pytest.mark.gpu
@@ -234,10 +239,8 @@ def test_a_captured_step_on_the_ground_is_nearly_the_eager_one():
     assert captured.physics.robot_state.contact_forces.norm(dim=2).sum(dim=1).median() > 100.0
 
 
-def test_a_captured_tracker_is_nearly_the_eager_one():
-    """Frames, noise and randomised values are drawn alike, and a quarter of a second later most robots are alike."""
-    cfg = config(("sim.physics", "mujoco_warp"), task="g1_tracking")
-    captured, eager = make_task(cfg, CUDA), make_task(cfg, CUDA, graph=False)
+def check_alike(captured, eager) -> None:
+    """Check that a quarter of a second after the same state most robots are alike in all that is shown."""
     assert (captured.captured, eager.captured) == (True, False)
     states = eager.state_dict()
     found, expected = (rollout(task, 0.3, states)[0][12] for task in (captured, eager))
@@ -246,6 +249,48 @@ def test_a_captured_tracker_is_nearly_the_eager_one():
         alike = difference < 1e-2
         assert alike.float().mean() > 0.9, f"{name}: of {ROBOTS} robots {int(alike.sum())} are alike"
     assert found["actor"].std() > 0.01
+
+
+AT_ONCE = [0.0, 0.0]
+HIT = [
+    ("domain_rand.held_goals.grow", AT_ONCE),
+    ("domain_rand.forces.punch.grow", AT_ONCE),
+    ("domain_rand.forces.punch.interval_s", [0.02, 0.1]),
+]
+"""Arms that move and punches that come from the start on."""
+SENT = [
+    ("commands.waypoints.share", 0.5),
+    ("commands.ranges.base_height", [0.6, 0.74]),
+    ("commands.ranges.base_pitch", [-0.1, 0.2]),
+]
+"""Waypoints for half of the robots, and heights and pitches of the base."""
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"), [("g1_tracking", []), ("g1_teleop", HIT), ("g1_flat", SENT)], ids=["frames", "arms", "waypoints"]
+)
+def test_a_captured_humanoid_is_nearly_the_eager_one(name, changes):
+    """Frames, goals of arms, punches, waypoints, noise and randomised values are drawn alike."""
+    cfg = config(("sim.physics", "mujoco_warp"), *changes, task=name)
+    captured = make_task(cfg, CUDA)
+    check_alike(captured, make_task(cfg, CUDA, graph=False))
+    if changes is HIT:
+        assert captured.physics.forces.abs().sum(dim=(1, 2)).count_nonzero() > 0
+        assert captured.control.held_offsets.std(dim=0).min() > 0.01
+    if changes is SENT:
+        assert captured.base_commands.std(dim=0).min() > 0.01
+
+
+def test_a_captured_tour_of_the_league_is_nearly_the_eager_one(tmp_path):
+    """With its first punch, which is in the sixth to the ninth control step."""
+    robot = league_robot("g1", tmp_path)
+    course = Course.of(range(ROBOTS), robot, np.array([(-0.5, 0.5), (-0.5, 0.5), (-1.0, 1.0)]))
+    cfg = config(("sim.physics", "mujoco_warp"), task="g1_teleop")
+    cfg = nominal(with_ideal_motors(cfg), rules(cfg, course, "punches", (robot.stiffness, robot.damping)))
+    captured, eager = (make_league(course, "punches", cfg, DEVICE, graph, None) for graph in (True, False))
+    check_alike(captured, eager)
+    assert captured.physics.forces is not None
+    assert int(captured.lasted.max()) == STEPS
 
 
 class ReadsOnTheHost(LeggedRobot):
