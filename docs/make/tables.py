@@ -31,7 +31,7 @@ NEW_GROUND = ("dense_blocks", "kerbs", "rubble")
 FLAT = ("anymal_c", "anymal_b", "anymal_d", "spot", "go1", "go2", "go2w", "a1", "g1", "h1", "cassie")
 TOLD_LESS = ("blind", "proprio", "estimator", "student", "student_ppo")
 """Variants of anymal_c whose policies observe less."""
-REAL = tuple(f"{robot}_real" for robot in ("anymal_c", "go2", "g1", "h1"))
+REAL = tuple(f"{robot}_real" for robot in ("anymal_c", "go2", "g1", "h1", "cassie"))
 SOLVERS = ("mujoco", "steel", "kamino", "featherstone", "xpbd", "semi_implicit")
 Result = dict[str, Any]
 

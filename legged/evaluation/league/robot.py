@@ -78,7 +78,7 @@ HEAD = 0.32479587 - 0.054
 
 @dataclass(frozen=True)
 class Humanoid:
-    """What differs between the robots that the league's runs are for."""
+    """Properties of a robot in the league."""
 
     hand: Any
     """(C, 3) points of the left hand in the frame of the arm's last link [m]."""
