@@ -316,7 +316,6 @@ class RobotsCamera(Camera):
     def picture(self, lines: Sequence[str] = ()) -> np.ndarray:
         """Return a picture (height, width, 3) uint8 of the robots in their present state, with lines of text."""
         size = self.task.physics.model.nq
-        drawn = slice(self.first, self.first + self.count)
         for i in range(self.count):
             self.task.physics.copy_to(self.first + i, self._single)
             self.data.qpos[i * size : (i + 1) * size] = self._single.qpos
@@ -328,12 +327,17 @@ class RobotsCamera(Camera):
         self._shade_feet()
         if self.ghost is not None:
             self.ghost.draw(self.renderer.scene, self.options, self.first, self.offsets)
-        if self.arrows and is_velocity_task(self.task):
-            self._draw_velocities(self.task, bases, drawn)
+        self.annotate(bases)
         return caption(self.render(), lines, (COMMANDED, ACTUAL))
 
-    def _draw_velocities(self, task: LeggedRobot, bases: np.ndarray, drawn: slice) -> None:
+    def annotate(self, bases: np.ndarray) -> None:
+        """Hook: add shapes to the picture of robots whose bases are at `bases` (count, 3) [m]: the arrows of velocities."""
+        if self.arrows and is_velocity_task(self.task):
+            self._draw_velocities(self.task, bases)
+
+    def _draw_velocities(self, task: LeggedRobot, bases: np.ndarray) -> None:
         """Draw two arrows above each of `bases` (count, 3) [m]: the commanded velocity, and above it the actual one."""
+        drawn = slice(self.first, self.first + self.count)
         commands = task.commands[drawn, :2].cpu().numpy()
         actual = task.base_lin_vel[drawn, :2].cpu().numpy()
         for i in range(self.count):
