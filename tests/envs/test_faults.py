@@ -46,7 +46,7 @@ GROUP = ["base_lin_vel", "base_ang_vel", "projected_gravity", "commands", "dof_p
 @pytest.fixture(autouse=True)
 def broken():
     """The task 'broken', registered for a test."""
-    config = {"extends": TASK, "rewards": {"scales": {"mine": 1.0}}, "observations": {"critic": GROUP}}
+    config = {"extends": TASK, "rewards": {"scales": {"mine": 1.0}}, "observations": {"groups": {"critic": {"terms": GROUP}}}}
     register("broken", {**config, "train": {"algorithm": {"symmetry": False}}}, Broken)
     yield
     del _REGISTERED["broken"]
