@@ -352,9 +352,8 @@ def contract_of(path: Path, entries: Mapping[str, Any]) -> Contract:
     ranges = np.array([said["command_ranges"][name] for name in COMMANDS], dtype=float).reshape(3, 2)
     right = np.isfinite(ranges).all(axis=1) & (ranges[:, 0] <= ranges[:, 1])
     check("command_ranges", "finite, and not above the upper limits", right, ranges[:, 0])
-    base = np.array([said.get("base_commands", {}).get(name, (0.0,) * 3) for name in BASE_COMMANDS], dtype=float).reshape(
-        2, 3
-    )
+    given = said.get("base_commands", dict.fromkeys(BASE_COMMANDS, (0.0, 0.0, 0.0)))
+    base = np.array([given[name] for name in BASE_COMMANDS], dtype=float).reshape(2, 3)
     right = np.isfinite(base).all(axis=1) & (np.diff(base) >= 0.0).all(axis=1)
     check("base_commands", "finite, and sorted: lowest, usual, highest", right, base[:, 1])
     control_dt, sim_dt = numbers("control_dt"), np.array(said.get("sim_dt", said["control_dt"]), dtype=float)

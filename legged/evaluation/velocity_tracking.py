@@ -34,7 +34,7 @@ GOLDEN = 0.6180339887498949
 SLOWEST = 0.1
 """Smallest mean speed for which a cost of transport is computed [m/s]."""
 BASE = {"height": "m", "pitch": "rad"}
-"""Commands of the base besides its velocity, and their units."""
+"""Commands besides the velocity, and their units."""
 GAIT = (
     ("duty factor", "duty_factor", 1.0, "{:.2f}"),
     ("steps per second and foot", "steps_per_s", 1.0, "{:.2f}"),
@@ -237,8 +237,8 @@ def print_tracking(result: dict[str, Any]) -> None:
         title += f", on level ground with bumps of up to {100 * result['bumps']:.2g} cm"
     rows: list[list[str]] = []
     cells = f"{len(result['cells'])} cells x {result['robots_per_cell']} robots x {result['measured_s']:.0f} s"
-    postures = [(f"base {name}", unit, result[f"rmse_{name}"]) for name, unit in BASE.items() if f"rmse_{name}" in result]
-    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang), *postures):
+    base = [(name, unit, result[f"rmse_{name}"]) for name, unit in BASE.items() if f"rmse_{name}" in result]
+    for name, unit, errors in (("velocity", "m/s", lin), ("yaw rate", "rad/s", ang), *base):
         if errors["mean"] is None:
             rows.append([f"{name} RMSE", "none", "every robot fell before it was measured"])
             continue

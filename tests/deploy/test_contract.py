@@ -105,7 +105,7 @@ def test_a_joint_without_limits_has_none_in_the_contract_too(folder, tmp_path):
             r"command_ranges: must be finite, and not above the upper limits, got 1",
         ),
         (
-            {"base_commands": {"height": [0.5, 0.8, 0.7]}},
+            {"base_commands": {"height": [0.5, 0.8, 0.7], "pitch": [0.0, 0.0, 0.0]}},
             r"base_commands: must be finite, and sorted: lowest, usual, highest, got 0\.8",
         ),
         (
