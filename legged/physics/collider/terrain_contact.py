@@ -21,44 +21,48 @@ from legged.physics.collider.contact_features import contact_features, find_hits
 from legged.physics.collider.ground import Ground, Hits, ground_of, room_for_hits
 from legged.terrain import HeightMap
 
-MODEL_FIELDS = (
-    "geom_condim",
-    "geom_priority",
-    "geom_solmix",
-    "geom_solref",
-    "geom_solimp",
-    "geom_friction",
-    "geom_margin",
-    "geom_gap",
-    "geom_adhesion",
-    "pair_dim",
-    "pair_solref",
-    "pair_solreffriction",
-    "pair_solimp",
-    "pair_margin",
-    "pair_gap",
-    "pair_adhesion",
-    "pair_friction",
-)
-"""Arrays of mujoco-warp's model, in the order of the kernel's arguments."""
-CONTACT_FIELDS = (
-    "dist",
-    "pos",
-    "frame",
-    "includemargin",
-    "friction",
-    "solref",
-    "solreffriction",
-    "solimp",
-    "dim",
-    "geom",
-    "efc_address",
-    "worldid",
-    "type",
-    "geomcollisionid",
-    "adhesion",
-)
-"""Arrays of mujoco-warp's contacts, in the order of the kernel's arguments."""
+
+@wp.struct
+class CollisionArrays:
+    """Arrays of mujoco-warp's model and data, which have the same names there. Those that begin with `contact_` are arrays of
+    its contacts, which have the rest of the name there.
+    """
+
+    geom_condim: wp.array[int]
+    geom_priority: wp.array[int]
+    geom_solmix: wp.array2d[float]
+    geom_solref: wp.array2d[wp.vec2]
+    geom_solimp: wp.array2d[vec5]
+    geom_friction: wp.array2d[wp.vec3]
+    geom_margin: wp.array2d[float]
+    geom_gap: wp.array2d[float]
+    geom_adhesion: wp.array2d[float]
+    pair_dim: wp.array[int]
+    pair_solref: wp.array2d[wp.vec2]
+    pair_solreffriction: wp.array2d[wp.vec2]
+    pair_solimp: wp.array2d[vec5]
+    pair_margin: wp.array2d[float]
+    pair_gap: wp.array2d[float]
+    pair_adhesion: wp.array2d[float]
+    pair_friction: wp.array2d[vec5]
+    geom_xpos: wp.array2d[wp.vec3]
+    geom_xmat: wp.array2d[wp.mat33]
+    contact_dist: wp.array[float]
+    contact_pos: wp.array[wp.vec3]
+    contact_frame: wp.array[wp.mat33]
+    contact_includemargin: wp.array[float]
+    contact_friction: wp.array[vec5]
+    contact_solref: wp.array[wp.vec2]
+    contact_solreffriction: wp.array[wp.vec2]
+    contact_solimp: wp.array[vec5]
+    contact_dim: wp.array[int]
+    contact_geom: wp.array[wp.vec2i]
+    contact_efc_address: wp.array2d[int]
+    contact_worldid: wp.array[int]
+    contact_type: wp.array[int]
+    contact_geomcollisionid: wp.array[int]
+    contact_adhesion: wp.array[float]
+    nacon: wp.array[int]
 
 
 @wp.kernel
@@ -71,51 +75,17 @@ def touch_ground(
     feature_start: wp.array[wp.vec3],
     feature_end: wp.array[wp.vec3],
     feature_radius: wp.array[float],
-    geom_condim: wp.array[int],
-    geom_priority: wp.array[int],
-    geom_solmix: wp.array2d[float],
-    geom_solref: wp.array2d[wp.vec2],
-    geom_solimp: wp.array2d[vec5],
-    geom_friction: wp.array2d[wp.vec3],
-    geom_margin: wp.array2d[float],
-    geom_gap: wp.array2d[float],
-    geom_adhesion: wp.array2d[float],
-    pair_dim: wp.array[int],
-    pair_solref: wp.array2d[wp.vec2],
-    pair_solreffriction: wp.array2d[wp.vec2],
-    pair_solimp: wp.array2d[vec5],
-    pair_margin: wp.array2d[float],
-    pair_gap: wp.array2d[float],
-    pair_adhesion: wp.array2d[float],
-    pair_friction: wp.array2d[vec5],
-    geom_xpos: wp.array2d[wp.vec3],
-    geom_xmat: wp.array2d[wp.mat33],
+    of: CollisionArrays,
     naconmax: int,
-    contact_dist: wp.array[float],
-    contact_pos: wp.array[wp.vec3],
-    contact_frame: wp.array[wp.mat33],
-    contact_includemargin: wp.array[float],
-    contact_friction: wp.array[vec5],
-    contact_solref: wp.array[wp.vec2],
-    contact_solreffriction: wp.array[wp.vec2],
-    contact_solimp: wp.array[vec5],
-    contact_dim: wp.array[int],
-    contact_geom: wp.array[wp.vec2i],
-    contact_efc_address: wp.array2d[int],
-    contact_worldid: wp.array[int],
-    contact_type: wp.array[int],
-    contact_geomcollisionid: wp.array[int],
-    contact_adhesion: wp.array[float],
-    nacon: wp.array[int],
 ):
     """Find up to MOST contacts of a feature, and append them to mujoco-warp's contacts. One thread per world and feature."""
     world, feature = wp.tid()
     geom = feature_geom[feature]
     radius = feature_radius[feature]
     geoms = wp.vec2i(terrain, geom)
-    margin, gap = contact_margin_gap(geom_margin, geom_gap, pair_margin, pair_gap, geoms, -1, world)
+    margin, gap = contact_margin_gap(of.geom_margin, of.geom_gap, of.pair_margin, of.pair_gap, geoms, -1, world)
     near = radius + margin + gap
-    position, turn = geom_xpos[world, geom], geom_xmat[world, geom]
+    position, turn = of.geom_xpos[world, geom], of.geom_xmat[world, geom]
     row = world * feature_geom.shape[0] + feature
     count = find_hits(
         ground, feature_kind[feature], position, turn, feature_start[feature], feature_end[feature], near, hits, row
@@ -123,19 +93,19 @@ def touch_ground(
     if count == 0:
         return
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        geom_condim,
-        geom_priority,
-        geom_solmix,
-        geom_solref,
-        geom_solimp,
-        geom_friction,
-        geom_adhesion,
-        pair_dim,
-        pair_solref,
-        pair_solreffriction,
-        pair_solimp,
-        pair_adhesion,
-        pair_friction,
+        of.geom_condim,
+        of.geom_priority,
+        of.geom_solmix,
+        of.geom_solref,
+        of.geom_solimp,
+        of.geom_friction,
+        of.geom_adhesion,
+        of.pair_dim,
+        of.pair_solref,
+        of.pair_solreffriction,
+        of.pair_solimp,
+        of.pair_adhesion,
+        of.pair_friction,
         geoms,
         -1,
         world,
@@ -161,22 +131,22 @@ def touch_ground(
             geoms,
             wp.vec2i(-1, -1),
             world,
-            contact_dist,
-            contact_pos,
-            contact_frame,
-            contact_includemargin,
-            contact_friction,
-            contact_solref,
-            contact_solreffriction,
-            contact_solimp,
-            contact_dim,
-            contact_geom,
-            contact_efc_address,
-            contact_worldid,
-            contact_type,
-            contact_geomcollisionid,
-            contact_adhesion,
-            nacon,
+            of.contact_dist,
+            of.contact_pos,
+            of.contact_frame,
+            of.contact_includemargin,
+            of.contact_friction,
+            of.contact_solref,
+            of.contact_solreffriction,
+            of.contact_solimp,
+            of.contact_dim,
+            of.contact_geom,
+            of.contact_efc_address,
+            of.contact_worldid,
+            of.contact_type,
+            of.contact_geomcollisionid,
+            of.contact_adhesion,
+            of.nacon,
         )
 
 
@@ -198,6 +168,10 @@ class TerrainContact:
         longest = max(feature.length for feature in features)
         self.ground = ground_of(height_map, largest, longest)
         self.hits = room_for_hits(d.nworld * len(features))
+        arrays = CollisionArrays()
+        for name in CollisionArrays.vars:  # type: ignore[attr-defined]
+            owner = d.contact if name.startswith("contact_") else m if hasattr(m, name) else d
+            setattr(arrays, name, getattr(owner, name.removeprefix("contact_")))
         self._inputs = [
             self.ground,
             self.hits,
@@ -207,14 +181,11 @@ class TerrainContact:
             wp.array([feature.start for feature in features], dtype=wp.vec3),
             wp.array([feature.end for feature in features], dtype=wp.vec3),
             wp.array([feature.radius for feature in features], dtype=float),
-            *(getattr(m, name) for name in MODEL_FIELDS),
-            d.geom_xpos,
-            d.geom_xmat,
+            arrays,
             d.naconmax,
         ]
-        self._outputs = [*(getattr(d.contact, name) for name in CONTACT_FIELDS), d.nacon]
         self._dim = (d.nworld, len(features))
         m.callback.contactfilter = self._append
 
     def _append(self, m: Any, d: Any) -> None:
-        wp.launch(touch_ground, dim=self._dim, inputs=self._inputs, outputs=self._outputs)
+        wp.launch(touch_ground, dim=self._dim, inputs=self._inputs)
