@@ -17,63 +17,27 @@ ADD, SCALE, INVERSE = wp.constant(HOW["add"]), wp.constant(HOW["scale"]), wp.con
 THREADS = 128
 """Number of GPU threads that share the numbers of one world. In a step, few worlds take new values. With one thread for each
 number and world, most threads would be idle. With 32, each thread would wait for memory about ten times."""
-MOST_ARRAYS = 14
-"""Largest number of arrays that one launch writes. All fields together need fewer."""
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Arrays:
-    """Model arrays with one row per world, (N, L) each."""
+class Rows:
+    """Model arrays with one row per world, (N, L) each. A kernel writes to any number of arrays, because it gets their
+    addresses.
+    """
 
-    a0: wp.array2d[float]
-    a1: wp.array2d[float]
-    a2: wp.array2d[float]
-    a3: wp.array2d[float]
-    a4: wp.array2d[float]
-    a5: wp.array2d[float]
-    a6: wp.array2d[float]
-    a7: wp.array2d[float]
-    a8: wp.array2d[float]
-    a9: wp.array2d[float]
-    a10: wp.array2d[float]
-    a11: wp.array2d[float]
-    a12: wp.array2d[float]
-    a13: wp.array2d[float]
+    address: wp.array[wp.uint64]
+    """Address of the first number of each array."""
+    length: wp.array[int]
+    """Length L of each array's rows."""
 
 
 @wp.func
-def put(to: Arrays, array: int, world: int, at: int, number: float) -> None:
+def put(to: Rows, array: int, world: int, at: int, number: float) -> None:
     """Write a number at position `at` of a world's row in one of the arrays."""
-    if array == 0:
-        to.a0[world, at] = number
-    elif array == 1:
-        to.a1[world, at] = number
-    elif array == 2:
-        to.a2[world, at] = number
-    elif array == 3:
-        to.a3[world, at] = number
-    elif array == 4:
-        to.a4[world, at] = number
-    elif array == 5:
-        to.a5[world, at] = number
-    elif array == 6:
-        to.a6[world, at] = number
-    elif array == 7:
-        to.a7[world, at] = number
-    elif array == 8:
-        to.a8[world, at] = number
-    elif array == 9:
-        to.a9[world, at] = number
-    elif array == 10:
-        to.a10[world, at] = number
-    elif array == 11:
-        to.a11[world, at] = number
-    elif array == 12:
-        to.a12[world, at] = number
-    else:
-        to.a13[world, at] = number
+    row = wp.array(ptr=to.address[array], shape=((world + 1) * to.length[array],), dtype=wp.float32)
+    row[world * to.length[array] + at] = number
 
 
 @wp.kernel
@@ -87,7 +51,7 @@ def write_drawn(
     entry: wp.array2d[int],
     weight: wp.array[float],
     ratios: wp.array[float],
-    to: Arrays,
+    to: Rows,
 ):
     """Compute the randomised numbers of the worlds in `mask`: each is the model's own number, to which the changes of all
     fields are applied in turn. `threads` threads per world share the numbers. `place` holds the array of each number and its
@@ -126,7 +90,7 @@ def copy_variants(
     chosen: wp.array[wp.int64],
     variants: wp.array2d[float],
     place: wp.array2d[int],
-    to: Arrays,
+    to: Rows,
 ):
     """Copy the chosen variant into the worlds of `mask`. `threads` threads per world share the numbers of the variant.
     `place` holds the array of each number and its position there.
@@ -144,14 +108,14 @@ def _threads() -> int:
     return 1 if wp.get_device().is_cpu else THREADS
 
 
-def _arrays(arrays: Sequence[Tensor]) -> Any:
-    """Return the struct of arrays (N, ...) that a kernel writes."""
-    assert len(arrays) <= MOST_ARRAYS
-    to = Arrays()
-    nothing = wp.zeros((1, 1), dtype=float)
-    for k in range(MOST_ARRAYS):
-        rows = wp.from_torch(arrays[k].view(len(arrays[k]), -1)) if k < len(arrays) else nothing
-        setattr(to, f"a{k}", rows)
+def _rows(arrays: Sequence[Tensor]) -> Any:
+    """Return the addresses of arrays (N, ...) that a kernel writes. The arrays must be contiguous, and must outlive the
+    result.
+    """
+    assert all(array.is_contiguous() and array.dtype is torch.float32 for array in arrays)
+    to = Rows()
+    to.address = wp.array([array.data_ptr() for array in arrays], dtype=wp.uint64)
+    to.length = wp.array([array[0].numel() for array in arrays], dtype=int)
     return to
 
 
@@ -193,7 +157,7 @@ class Redraws:
             wp.array([entry[:3] for entry in entries], dtype=int, ndim=2),
             wp.array([entry[3] for entry in entries], dtype=float),
             wp.from_torch(ratios),
-            _arrays(list(arrays.values())),
+            _rows(list(arrays.values())),
         ]
         self._dim = (len(drawn), _threads())
 
@@ -213,7 +177,7 @@ class Variants:
         widths = [made[0].numel() for made, _ in arrays.values()]
         place = [(number, at) for number, width in enumerate(widths) for at in range(width)]
         targets = [array for _, array in arrays.values()]
-        self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _arrays(targets)]
+        self._inputs = [wp.from_torch(self._variants), wp.array(place, dtype=int, ndim=2), _rows(targets)]
         self._dim = (len(targets[0]), _threads())
 
     @staticmethod
