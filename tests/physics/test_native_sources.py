@@ -37,18 +37,11 @@ template <int N> struct numbers { float x[N]; };
 """
 """What the sources know of Warp: arrays, with vectors and matrices as elements."""
 SCALARS = {wp.int32: "int", wp.float32: "float", wp.bool: "bool", wp.uint64: "unsigned long long"}
-SETTINGS = {
-    "solver": "int most_rounds, int most_searches, float tolerance, float ls_tolerance, ",
-    "dynamics": "",
-    "contacts": "int found, ",
-}
+NUMBERS = {wp.int32: ctypes.c_int, wp.float32: ctypes.c_float}
+SETTINGS = {"solver": "", "dynamics": "", "contacts": "int found, "}
 FILES = {"solver": constraint_solver.SOURCE, "dynamics": smooth_dynamics.SOURCE, "contacts": CONTACT_SOURCE}
 STRUCTS = {"solver": SolverArrays, "dynamics": DynamicsArrays, "contacts": StageArrays}
-GIVEN = {
-    "solver": "MOST, MOST, 1e-9f, 0.01f, ",
-    "dynamics": "",
-    "contacts": "counted(all, world), ",
-}
+GIVEN = {"solver": "", "dynamics": "", "contacts": "counted(all, world), "}
 """What a world is called with, beside its number and the arrays."""
 COUNTED = """
 int counted(const Arrays* all, int world) {  // contacts of a world, by those slots that have rows
@@ -72,11 +65,15 @@ def constants_of(file: str, model: mujoco.MjModel) -> dict[str, int | bool]:
     return dynamics_constants(model)
 
 
+def array_type(kind: Any) -> str:
+    """Return the type of arrays with elements of a Warp type."""
+    return f"array_of<{SCALARS.get(kind) or f'numbers<{math.prod(kind._shape_)}>'}>"
+
+
 def program(file: str, constants: dict[str, Any], on_gpu: bool) -> str:
     """Return a C++ program with the native source as a function, of a Warp struct for one."""
-    types = {name: var.type.dtype for name, var in STRUCTS[file].vars.items()}
-    elements = {name: SCALARS.get(kind) or f"numbers<{math.prod(kind._shape_)}>" for name, kind in types.items()}
-    fields = "".join(f"array_of<{element}> {name};\n" for name, element in elements.items())
+    types = {name: var.type for name, var in STRUCTS[file].vars.items()}
+    fields = "".join(f"{SCALARS.get(kind) or array_type(kind.dtype)} {name};\n" for name, kind in types.items())
     function = f"void compute_world(int world, {SETTINGS[file]}Arrays arrays) {{\n{native_source(FILES[file], constants)}}}\n"
     return f"{WARP_ON_CPU.read_text() if on_gpu else ''}{SHIM}struct Arrays {{\n{fields}}};\n{function}"
 
@@ -135,7 +132,7 @@ def lanes_of(folder: Path, file: str, constants: dict[str, Any]) -> Any:
     source = folder / f"{file}.cpp"
     source.write_text(
         program(file, constants, on_gpu=True)
-        + "const int MOST = 50; int worlds;\n"
+        + "int worlds;\n"
         + (COUNTED if file == "contacts" else "")
         + f"void lane(void* with) {{ Arrays* all = (Arrays*)with; for (int world = 0; world < worlds; ++world) {call}; }}\n"
         + 'extern "C" bool compute(int count, bool backwards, Arrays* all) {\n'
@@ -149,12 +146,19 @@ def lanes_of(folder: Path, file: str, constants: dict[str, Any]) -> Any:
 
 def by_lanes(compute: Any, file: str, struct: Any, worlds: int, backwards: bool) -> None:
     """Compute worlds in the arrays of an instance of the file's Warp struct."""
-    arrays = [getattr(struct, name) for name in STRUCTS[file].vars]
-    assert all(array.is_contiguous for array in arrays if array.size)
-    shapes = [(ctypes.c_int * 4)(*array.shape) for array in arrays]
-    passed = (ArrayOf * len(arrays))(*(ArrayOf(array.ptr, shape) for array, shape in zip(arrays, shapes, strict=True)))
+
+    class Passed(ctypes.Structure):
+        _fields_ = [(name, NUMBERS.get(var.type, ArrayOf)) for name, var in STRUCTS[file].vars.items()]
+
+    passed = Passed()
+    for name, kind in Passed._fields_:
+        value = getattr(struct, name)
+        if kind is ArrayOf:
+            assert value.is_contiguous or not value.size
+            value = ArrayOf(value.ptr, (ctypes.c_int * 4)(*value.shape))
+        setattr(passed, name, value)
     compute.restype = ctypes.c_bool
-    assert compute(worlds, backwards, passed), "a lane waits where others do not"
+    assert compute(worlds, backwards, ctypes.byref(passed)), "a lane waits where others do not"
 
 
 def in_every_way(launch: Any, compute: Any, file: str, struct: Any, names: tuple[str, ...]) -> list[list[np.ndarray]]:

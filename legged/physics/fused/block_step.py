@@ -40,10 +40,6 @@ def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
         items: Candidates,
         cells: Ground,
         hits: Hits,
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
         solver: SolverArrays,
         state: StateArrays,
     ) -> None:
@@ -53,7 +49,7 @@ def block_kernel(step: TorqueStep, contacts: ContactStage) -> Any:
             if not moved:
                 move_world(world, dynamics)
             contacts_of_world(world, 0, 1, stage, items, cells, hits)
-        solve_block(start, end, most_rounds, most_searches, tolerance, ls_tolerance, solver)
+        solve_block(start, end, solver)
         for world in range(start, stop):
             for joint in range(state.jnt_type.shape[0]):
                 integrate_joint(world, joint, state)
@@ -68,9 +64,8 @@ class BlockStep:
         """Prepare to launch `step` and `contacts` on `threads` threads. `fits(step)` must be True."""
         self._step, self._contacts = step, contacts
         self._kernel = block_kernel(step, contacts)
-        solver = step.solver
         moved = contacts.equalities  # with equality constraints, `_before_blocks` computes the poses
-        self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, *solver.settings, solver.arrays, step.state]
+        self._inputs = [moved, step.dynamics.arrays, *contacts.inputs, step.solver.arrays, step.state]
         blocks = -(-step.worlds // WIDE)
         threads = min(threads, blocks)
         edges = [min(WIDE * (blocks * k // threads), step.worlds) for k in range(threads + 1)]

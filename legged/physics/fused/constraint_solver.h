@@ -1,6 +1,7 @@
 // MuJoCo's Newton solver for the constraint forces of one world. This file comes after constraint_rows.h, elliptic_cones.h
 // and elimination.h. Constants: DAMPED (dampers are integrated implicitly), and SPLIT, FRICTION, ELLIPTIC, KNOWN as there.
 
+const float tolerance = arrays.tolerance, ls_tolerance = arrays.ls_tolerance;
 int round = 0;
 const float INFINITE = 3.0e38f, ENOUGH = 0.1f;
 float alpha = 0.0f;  // last step length; if it is 1 and no state changes, the minimum is reached
@@ -60,7 +61,7 @@ while (true) {
             squares += OF(grad, i) * OF(grad, i);
         }
         squares = sum(squares);
-        if (round == most_rounds || (!guessing && scale * sqrtf(squares) < tolerance) || (alpha == 1.0f && !changed)) {
+        if (round == arrays.most_rounds || (!guessing && scale * sqrtf(squares) < tolerance) || (alpha == 1.0f && !changed)) {
             if (!DAMPED) break;
             advancing = true;
         }
@@ -101,7 +102,7 @@ while (true) {
     float low = 0.0f, high = -1.0f;
     // The second step needs no line search either, since the row states that it starts from are mostly right.
     const bool whole = guessing || (KNOWN && round == 1);
-    ROLLED for (int k = whole ? most_searches : 0; k < most_searches; ++k) {
+    ROLLED for (int k = whole ? arrays.most_searches : 0; k < arrays.most_searches; ++k) {
         float first = 0.0f, second = 0.0f;
         EACH_ROW(r) {
             if (ELLIPTIC && directions[r] != 0) {

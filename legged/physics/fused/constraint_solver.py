@@ -91,16 +91,12 @@ def solver_kernel(constants: dict[str, int | bool]) -> Any:
     """Return the kernel for a set of `solver_constants`. Its launch dimension is (worlds, lanes)."""
 
     @wp.func_native(native_source(SOURCE, constants))
-    def solve_world(
-        world: int, most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
-    ) -> None: ...
+    def solve_world(world: int, arrays: SolverArrays) -> None: ...
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=(LANES, blocks(constants)))
-    def solve_constraints(
-        most_rounds: int, most_searches: int, tolerance: float, ls_tolerance: float, arrays: SolverArrays
-    ) -> None:
+    def solve_constraints(arrays: SolverArrays) -> None:
         world, _lane = wp.tid()  # type: ignore[misc]
-        solve_world(world, most_rounds, most_searches, tolerance, ls_tolerance, arrays)
+        solve_world(world, arrays)
 
     return solve_constraints
 
@@ -142,13 +138,9 @@ class ConstraintSolver:
         self._kernel = solver_kernel(self.constants) if self.wide is None else wide_kernel(self.wide)
         self._lanes = lanes_of(d.qacc.device)
         efc, opt = d.efc, m.opt
-        self.settings = [
-            opt.iterations,
-            opt.ls_iterations,
-            float(opt.tolerance.numpy()[0]),
-            float(opt.ls_tolerance.numpy()[0]),
-        ]
         arrays = self.arrays = SolverArrays()
+        arrays.most_rounds, arrays.most_searches = opt.iterations, opt.ls_iterations
+        arrays.tolerance, arrays.ls_tolerance = float(opt.tolerance.numpy()[0]), float(opt.ls_tolerance.numpy()[0])
         for name, table in tree.tables().items():
             setattr(arrays, name, wp.array(table, dtype=wp.uint64 if name == "path" else int))
         arrays.entry_row, arrays.entry_column = wp.array(rows, dtype=int), wp.array(columns[: len(rows)], dtype=int)
@@ -189,8 +181,7 @@ class ConstraintSolver:
 
     def solve(self) -> None:
         """Compute qacc, qfrc_constraint and efc.force from M, qfrc_smooth, the constraint rows and the last acceleration."""
-        inputs = [*self.settings, self.arrays]
         if self.wide is not None:
-            wp.launch(self._kernel, dim=-(-self._worlds // WIDE), inputs=[0, self._worlds, *inputs])
+            wp.launch(self._kernel, dim=-(-self._worlds // WIDE), inputs=[0, self._worlds, self.arrays])
         else:
-            wp.launch(self._kernel, dim=(self._worlds, self._lanes), inputs=inputs, block_dim=self._lanes)
+            wp.launch(self._kernel, dim=(self._worlds, self._lanes), inputs=[self.arrays], block_dim=self._lanes)

@@ -1,4 +1,4 @@
-"""Arrays of the constraint solver."""
+"""Arrays and settings of the constraint solver."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ Vector5 = wp.types.vector(length=5, dtype=wp.float32)
 class SolverArrays:
     """Arrays of the solver: its own tables, and arrays of mujoco-warp's model and data. The solver writes the arrays from
     `qacc` to `rounds`. If dampers are integrated implicitly, it writes `advance`. If rows have keys (`row_key`), it writes
-    their final states to `last_rows`.
+    their final states to `last_rows`. The last four entries are settings.
     """
 
     dof_depth: wp.array[int]
@@ -47,3 +47,7 @@ class SolverArrays:
     advance: wp.array2d[float]
     row_key: wp.array2d[int]
     last_rows: wp.array2d[int]
+    most_rounds: int
+    most_searches: int
+    tolerance: float
+    ls_tolerance: float

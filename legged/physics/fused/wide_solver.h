@@ -14,6 +14,7 @@ typedef int Mask __attribute__((vector_size(4 * WIDE), may_alias));
 const Wide ZERO = Wide{};
 const Wide ONE = ZERO + 1.0f;
 const float TINY = 1e-15f, INFINITE = 3.0e38f, ENOUGH = 0.1f;
+const float tolerance = arrays.tolerance, ls_tolerance = arrays.ls_tolerance;
 const int SPARSE = PATH_START[NV - 1] + PATH_LENGTH[NV - 1], DENSE = NV * (NV + 1) / 2;
 
 auto any_of = [](const Mask& mask) {
@@ -231,7 +232,7 @@ for (int round = 0;; ++round) {
         squares += grad[i] * grad[i];
         s[i] = -grad[i];
     }
-    if (round == most_rounds) break;
+    if (round == arrays.most_rounds) break;
     const Mask whole = guessing ? guess : Mask{};  // worlds that take a full step
     active &= whole | ~(scale * scale * squares < tolerance * tolerance);
     active &= changed | (alpha != ONE);
@@ -269,7 +270,7 @@ for (int round = 0;; ++round) {
     Wide low = ZERO, high = -ONE;
     // The second step needs no line search either, since the row states that it starts from are mostly right.
     Mask searching = KNOWN && round == 1 ? Mask{} : active & ~whole;
-    for (int k = 0; k < most_searches && any_of(searching); ++k) {
+    for (int k = 0; k < arrays.most_searches && any_of(searching); ++k) {
         Wide first = slope + alpha * bend, second = bend;
         for (int r = 0; r < rows; ++r) {
             const Wide pull = -D[r] * (x[r] + alpha * jv[r]);

@@ -61,15 +61,7 @@ def wide_function(constants: dict[str, Constant]) -> Any:
     """Return the kernel's device function. It computes one block: up to `WIDE` worlds from `start` on, all before `end`."""
 
     @wp.func_native(native_source(SOURCE, constants))
-    def solve_block(
-        start: int,
-        end: int,
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
-        arrays: SolverArrays,
-    ) -> None: ...
+    def solve_block(start: int, end: int, arrays: SolverArrays) -> None: ...
 
     return solve_block
 
@@ -81,16 +73,8 @@ def wide_kernel(constants: dict[str, Constant]) -> Any:
     solve_block = wide_function(constants)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def solve_blocks(
-        first: int,
-        end: int,
-        most_rounds: int,
-        most_searches: int,
-        tolerance: float,
-        ls_tolerance: float,
-        arrays: SolverArrays,
-    ) -> None:
+    def solve_blocks(first: int, end: int, arrays: SolverArrays) -> None:
         start = first + wp.tid() * WIDE  # type: ignore[operator]
-        solve_block(start, end, most_rounds, most_searches, tolerance, ls_tolerance, arrays)
+        solve_block(start, end, arrays)
 
     return solve_blocks
