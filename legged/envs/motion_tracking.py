@@ -33,9 +33,10 @@ from legged.motion.kinematics import Skeleton
 from legged.motion.readers import motion_files, read_clip
 from legged.robots.robot import load_robot
 
-ERRORS = ("world_error", "body_error", "extremity_error", "joint_error")
+ERRORS = ("world_error", "body_error", "extremity_error", "joint_error", "largest_error")
 """Mean distances of bodies from their places in the world, and of bodies and extremities from their places relative to the
-anchor [m]; the root mean square error of the joint angles [rad]."""
+anchor [m]; the root mean square error of the joint angles [rad]; the largest of all bodies' distances from their places
+relative to the anchor [m]."""
 
 
 class MotionTracking(RobotTask):
@@ -95,7 +96,7 @@ class MotionTracking(RobotTask):
         """(N, B, 3) positions of the reference's bodies, moved to the robot [m]; `target_quat` (N, B, 4) are orientations."""
         self.target_quat = torch.zeros_like(self.bodies.quat)
         self.errors = torch.zeros(self.num_envs, len(ERRORS), device=device)
-        """(N, 4) errors of the step, before resets, in the order of `ERRORS`."""
+        """(N, 5) errors of the step, before resets, in the order of `ERRORS`."""
 
     # ---- hooks of a control step -------------------------------------------------------------------------------------
 
@@ -126,7 +127,7 @@ class MotionTracking(RobotTask):
         world, moved = ((pos - bodies.pos).norm(dim=2) for pos in (now.pos, self.target_pos))
         joint = (now.joint_pos - self.dof_pos).square().mean(dim=1).sqrt()
         extremity = moved[:, self._extremities].mean(dim=1)
-        torch.stack([world.mean(dim=1), moved.mean(dim=1), extremity, joint], dim=1, out=self.errors)
+        torch.stack([world.mean(dim=1), moved.mean(dim=1), extremity, joint, moved.amax(dim=1)], dim=1, out=self.errors)
 
     def update_curricula(self) -> None:
         self.motion.count(self.terminated_buf)

@@ -85,17 +85,23 @@ def measure_motion(task: MotionTracking, act: Policy, overflows: Overflows) -> d
 
 @torch.inference_mode()
 def _from_anywhere(task: MotionTracking, act: Policy, overflows: Overflows) -> dict[str, Any]:
-    """Return success and mean errors of robots that begin in random frames, and success by the second of the beginning."""
+    """Return success and mean errors of robots that begin in random frames, success by the second of the beginning, and mean
+    errors by the second of the motion.
+    """
     task.reset_curricula()
     observations = task.reset()
     begun = task.motion.drawn.clone()
     running = torch.ones_like(task.reset_buf)
     errors, steps = torch.zeros_like(task.errors), torch.zeros_like(task.rew_buf)
+    sums = torch.zeros(len(task.motion.table.rows), len(ERRORS) + 1, device=task.device)  # of errors, and of steps, by frame
     for _ in range(round(SUCCESS_S / task.dt)):
+        frame = task.motion.frame.clone()
         observations, _, _, extras = task.step(act(observations))
         overflows.add(extras)
         seen = running & task.valid
-        errors += torch.where(seen.unsqueeze(1), task.errors, 0.0)
+        now = torch.where(seen.unsqueeze(1), task.errors, 0.0)
+        sums.index_add_(0, frame, torch.cat([now, seen.unsqueeze(1)], dim=1))
+        errors += now
         steps += seen
         running &= ~task.terminated_buf
     count, successes = task.num_envs, int(running.sum())
@@ -114,6 +120,11 @@ def _from_anywhere(task: MotionTracking, act: Policy, overflows: Overflows) -> d
             {"second": second, "episodes": int(there.sum()), "successes": int((there & running).sum())}
             for second in range(int(seconds.max()) + 1)
             if (there := seconds == second).any()
+        ],
+        "errors_by_second": [
+            dict(zip(("second", *ERRORS), (second, *(total[:-1] / total[-1]).tolist()), strict=True))
+            for second, part in enumerate(sums.split(round(1.0 / task.dt)))
+            if (total := part.sum(dim=0))[-1] > 0.0
         ],
     }
 
@@ -136,7 +147,9 @@ def motions_table(title: str, measured: Iterable[tuple[str, dict[str, Any]]]) ->
     for name, found in measured:
         whole = found["whole"]
         share, low, high = (100.0 * found[key] for key in ("share", "low", "high"))
-        errors = (f"{found[key]:.3f}" for key in ("body_error", "world_error", "extremity_error", "joint_error"))
+        errors = (f"{found[key]:.3f}" for key in ("body_error", "world_error", "joint_error"))
+        worst = max(found["errors_by_second"], key=lambda part: part["largest_error"])
         lasted = "tracked" if whole["success"] else f"falls at {whole['lasted_s']:.1f} s"
         rows.append([name, f"{found['seconds']:.1f}", f"{share:.1f} ({low:.1f} to {high:.1f})", lasted, *errors])
-    return screen_table(title, [*heads, "extremities [m]", "joints [rad]"], rows)
+        rows[-1].append(f"{worst['largest_error']:.3f} at {worst['second']} s")
+    return screen_table(title, [*heads, "joints [rad]", "largest, worst second [m]"], rows)

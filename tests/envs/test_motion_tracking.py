@@ -251,14 +251,19 @@ def test_a_saved_state_goes_on_with_its_frames():
 
 
 def test_errors_are_those_of_a_displaced_robot():
-    """0.3 m along x: only the error in the world. One knee bent by 0.1 rad: the root mean square over 29 joints."""
+    """0.3 m along x: only the error in the world. One knee bent by 0.1 rad: the root mean square over 29 joints, and the
+    distance that the ankle below the knee moves.
+    """
     task = tracking(still())
     put(task, (0.3, 0.0, HEIGHT))
-    assert task.errors[0].tolist() == pytest.approx([0.3, 0.0, 0.0, 0.0], abs=1e-6)
+    assert task.errors[0].tolist() == pytest.approx([0.3, 0.0, 0.0, 0.0, 0.0], abs=1e-6)
     joints = task.default_dof_pos.clone()
     joints[3] += 0.1
     put(task, joints=joints)
     assert float(task.errors[0, 3]) == pytest.approx(0.1 / math.sqrt(29), abs=1e-6)
+    upper, lower = 0.30001, 0.017558  # from the knee to the pitch axis of the ankle, and on to the roll axis [m]
+    shank = math.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * math.cos(float(task.default_dof_pos[4])))
+    assert float(task.errors[0, 4]) == pytest.approx(2.0 * math.sin(0.05) * shank, abs=1e-5)
 
 
 def test_draws_have_their_chances_and_stay_in_the_clips():
@@ -292,6 +297,10 @@ def test_a_tracker_is_trained_and_plays(capsys):
     assert 0.0 < squat["whole"]["lasted_s"] < squat["seconds"]
     assert squat["seconds"] == pytest.approx(275 / 50)
     assert 0.0 < squat["body_error"] < squat["world_error"] < 1.0
+    parts = squat["errors_by_second"]
+    assert [part["second"] for part in parts] == list(range(6))
+    assert min(part["body_error"] for part in parts) < squat["body_error"] < max(part["body_error"] for part in parts)
+    assert all(part["body_error"] < part["largest_error"] for part in parts)
 
 
 @pytest.mark.parametrize(
