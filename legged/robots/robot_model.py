@@ -79,9 +79,9 @@ def _warnings_to(warnings: list[str]) -> Iterator[None]:
 
 
 def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[str] = ()) -> None:
-    """Check the conditions that engines rely on. The first joint is the base's free joint. Each later joint is passive (a
-    pattern in `passive` matches its name) or is a hinge with one motor. Motors are in the order of their hinges. Collision
-    shapes have names.
+    """Check the conditions that engines rely on, as far as `robot_spec_of` does not ensure them. The first joint is on the
+    base. Each later joint is passive (a pattern in `passive` matches its name) or is a hinge with one motor, whose torque has
+    a limit. No shape or sensor has a name that the scene needs.
 
     Raises:
         ConfigError: a condition is not met; the message begins with `where`.
@@ -89,15 +89,6 @@ def check_model(model: mujoco.MjModel, base: str, where: str, passive: Sequence[
     undriven = passive_joints(model, passive, where)
     _check_tree(model, base, undriven, where)
     _check_motors(model, undriven, where)
-    for i in range(model.ngeom):
-        if not (model.geom_contype[i] or model.geom_conaffinity[i]):
-            continue
-        name, body = model.geom(i).name, model.body(model.geom_bodyid[i])
-        if body.weldid[0] == 0:
-            alone = "leave it out, because the task adds the ground"
-            raise ConfigError(f"{where}: model: geom '{name}' is fixed to the world; {alone}")
-        if not name:
-            raise ConfigError(f"{where}: model: every collision geom needs a name; one of body '{body.name}' has none")
     for kind, count in (("geom", model.ngeom), ("sensor", model.nsensor)):
         for name in (getattr(model, kind)(i).name for i in range(count)):
             if re.fullmatch(RESERVED[kind], name):
@@ -138,56 +129,26 @@ def driven_joints(model: mujoco.MjModel, passive: Collection[int]) -> list[int]:
 
 def _check_tree(model: mujoco.MjModel, base: str, passive: Collection[int], where: str) -> None:
     bodies = [model.body(i).name for i in range(model.nbody)]
-    kinds = mujoco.mjtJoint
     if base not in bodies:
         raise ConfigError(f"{where}: base: the model has no body '{base}'{suggest(base, bodies)}")
-    joints = driven_joints(model, passive)
-    free = model.jnt_type == kinds.mjJNT_FREE
-    if model.njnt == 0 or not free[0] or free.sum() > 1 or (model.jnt_type[joints] != kinds.mjJNT_HINGE).any():
-        but = "; list slides and balls under passive_joints" if free.sum() == 1 and free[0] else ""
-        raise ConfigError(f"{where}: model: needs one free joint, on the base, followed by hinges only{but}")
-    if not joints:
-        raise ConfigError(f"{where}: model: has no hinge with a motor, so nothing could move the robot")
+    if (model.jnt_type[driven_joints(model, passive)] != mujoco.mjtJoint.mjJNT_HINGE).any():
+        hinges = "needs one free joint, on the base, followed by hinges only"
+        raise ConfigError(f"{where}: model: {hinges}; list slides and balls under passive_joints")
     if model.jnt_bodyid[0] != bodies.index(base):
         raise ConfigError(f"{where}: base: the free joint is on '{bodies[model.jnt_bodyid[0]]}', not on '{base}'")
-    for i in joints:
-        if not model.joint(i).name:
-            raise ConfigError(f"{where}: model: hinges need names; one of body '{bodies[model.jnt_bodyid[i]]}' has none")
 
 
 def _check_motors(model: mujoco.MjModel, passive: Collection[int], where: str) -> None:
-    """Check that each driven hinge has one torque motor with a valid limit, in the order of the hinges."""
+    """Check that each driven hinge has one motor with a valid torque limit, in the order of the hinges."""
     names = tuple(model.joint(i).name for i in driven_joints(model, passive))
-    on_joints = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    driven = tuple(model.joint(model.actuator_trnid[i, 0]).name if on_joints[i] else "no joint" for i in range(model.nu))
+    driven = tuple(model.joint(model.actuator_trnid[i, 0]).name for i in range(model.nu))
     if driven != names:
         extra = "; list joints without a motor under passive_joints" if len(driven) < len(names) else ""
         order = "needs one motor per hinge in the same order"
         raise ConfigError(f"{where}: model: {order}; hinges {names}, motors {driven}{extra}")
     for i, joint in enumerate(names):
-        problem = _why_no_torque_motor(model, i) or _why_no_torque_limit(model, i)
-        if problem:
+        if problem := _why_no_torque_limit(model, i):
             raise ConfigError(f"{where}: model: the actuator of '{joint}' {problem}")
-
-
-def _why_no_torque_motor(model: mujoco.MjModel, i: int) -> str:
-    """Return the reason why an actuator does not apply its control as a torque; '' if it does."""
-    gain, bias, dynamics = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
-    if (
-        gain != mujoco.mjtGain.mjGAIN_FIXED
-        or model.actuator_gainprm[i, 0] != 1.0
-        or bias != mujoco.mjtBias.mjBIAS_NONE
-        or dynamics != mujoco.mjtDyn.mjDYN_NONE
-    ):
-        return "is not a torque motor: the task computes torques and needs <motor>, not <position>, <velocity> or the like"
-    if _first(model.actuator_gear[i]) != 1.0:
-        return f"has a gear of {model.actuator_gear[i, 0]:g}; the gear must be 1, because controls are the joints' torques"
-    return ""
-
-
-def _first(values: Sequence[float]) -> float:
-    """Return the first number if all others are 0, else NaN."""
-    return float(values[0]) if not np.any(values[1:]) else float("nan")
 
 
 def _why_no_torque_limit(model: mujoco.MjModel, i: int) -> str:
