@@ -22,7 +22,7 @@ from devices import CUDA, ON_A_GPU, build, on_gpu
 from helpers import kept_global_state
 
 from legged.physics import Physics, RobotScene
-from legged.physics.fused.torque_step import TorqueStep
+from legged.physics.fused.smooth_dynamics import SmoothDynamics
 from legged.process import neighbours
 from legged.robots.robot import Robot, load_robot
 
@@ -96,7 +96,7 @@ def device(request: pytest.FixtureRequest) -> str:
 
 def stages_kept() -> AbstractContextManager:
     """Return a context in which a mujoco_warp that is built has our constraint solver among its own launches for all else."""
-    return mock.patch.object(TorqueStep, "why_not", return_value="the test wants stages")
+    return mock.patch.object(SmoothDynamics, "why_not", return_value="the test wants stages")
 
 
 @pytest.fixture(params=["mujoco", "mujoco_warp", "newton", *map(on_gpu, ("mujoco_warp, cuda", "newton, cuda"))])

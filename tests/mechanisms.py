@@ -13,6 +13,7 @@ import warp as wp
 
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.contact_stage import ContactStage
+from legged.physics.fused.smooth_dynamics import SmoothDynamics
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -207,7 +208,7 @@ class FusedWorlds:
             self.m.opt.run_qacc_smooth = False
             self.m.opt.tolerance.fill_(1e-9)  # mujoco-warp's least, 1e-6, would leave light joints beside heavy ones alone
             assert ConstraintSolver.why_not(self.m, self.d) == ""
-            assert TorqueStep.why_not(model, drawn) == ""
+            assert SmoothDynamics.why_not(model, drawn) == ""
             self.m.opt.disableflags |= absent_stages(model, drawn)
             own = not ContactStage.why_not(model, self.m, self.d, drawn)
             self._contacts = ContactStage(model, self.m, self.d, drawn) if own else None

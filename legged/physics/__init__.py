@@ -84,12 +84,8 @@ def check_engine(
 
     Raises:
         ConfigError: the engine cannot do this, is not installed, or does not run on the device.
-        ValueError: a field or a quantity does not exist.
+        ValueError: a quantity does not exist.
     """
-    for field in randomized:
-        if field not in FIELDS or not FIELDS[field].changes:
-            known = [name for name in FIELDS if FIELDS[name].changes]
-            raise ValueError(f"randomize: there is no model field '{field}'{suggest(field, known, 'fields')}")
     check_quantities(quantities)
     if resolve_physics(sim.physics, device, where("sim.physics")) != "newton":
         return

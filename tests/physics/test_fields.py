@@ -14,7 +14,7 @@ from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import FIELDS, ModelScene, Physics, RobotScene, check_ranges
 from legged.physics.fields import changed_arrays
-from legged.physics.fused.torque_step import TorqueStep
+from legged.physics.fused.smooth_dynamics import SmoothDynamics
 from legged.physics.randomized_model import RandomizedModel
 from legged.physics.warp.mujoco_warp import absent_stages
 
@@ -250,7 +250,7 @@ def test_a_servos_pull_towards_its_target_grows_with_its_gain(engine, tmp_path):
 def test_the_fused_step_takes_every_field_of_the_table(robot, field):
     """Its launches read the arrays per world, or leave them to those that make contacts and constraint rows."""
     model = RobotScene(robot).model(SimConfig())
-    assert TorqueStep.why_not(model, changed_arrays([field])) == ""
+    assert SmoothDynamics.why_not(model, changed_arrays([field])) == ""
 
 
 def test_stages_that_a_randomised_array_needs_are_launched():

@@ -3,16 +3,18 @@
 import shutil
 
 import mujoco
+import mujoco_warp as mjw
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from mechanisms import CROOKED, EVERY_JOINT, FusedWorlds, c_worlds, packaged, random_motion, random_tree, relative_error
 from reference import CWorlds, random_states
 
 from legged.config.world import SimConfig
 from legged.errors import ConfigError
 from legged.physics import make_physics as build_physics
-from legged.physics.fused.torque_step import TorqueStep
+from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.scene import RobotScene
 from legged.robots.robot import Robot, load_robot
 
@@ -28,9 +30,11 @@ def changed(robot: Robot, folder, old: str, new: str) -> Robot:
 
 def test_a_model_with_another_integrator_is_refused(robot):
     model = RobotScene(robot).model(SimConfig())
-    assert TorqueStep.why_not(model) == ""
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    assert TorqueStep.why_not(model) == "the model's integrator is not Euler"
+    ask_for_dense_rows(model)
+    for integrator, reason in (("EULER", ""), ("IMPLICITFAST", "the model's integrator is not Euler")):
+        model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+        with wp.ScopedDevice("cpu"):
+            assert ConstraintSolver.why_not(mjw.put_model(model), mjw.make_data(model, njmax=20)) == reason
 
 
 def test_what_keeps_a_robot_off_is_said(robot, tmp_path):

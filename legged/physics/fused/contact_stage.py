@@ -100,21 +100,17 @@ class ContactStage:
 
     @staticmethod
     def why_not(model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = ()) -> str:
-        """Return the reason why `model` is not supported, or an empty text. `m` and `d` are mujoco-warp's model and data for
-        it; `randomized` names the arrays in which worlds differ.
+        """Return the reason why a `model` that `ConstraintSolver` supports is not supported here, or an empty text. `m` and
+        `d` are mujoco-warp's model and data for it; `randomized` names the arrays in which worlds differ.
         """
         if drawn := [name for name in FIXED if name in randomized]:
             return f"{drawn[0]} differs between worlds"
         if "geom_solref" in randomized and not contact_pairs.alike_springs(model, contact_pairs.pairs_of(m)):
             return "restitution differs between worlds, and shapes that may touch have different solref"
-        if m.is_sparse:
-            return "mujoco-warp stores sparse Jacobians for the model"
         if model.nflex or np.any(model.tendon_limited) or np.any(model.tendon_frictionloss):
             return "the model has flexes, or tendons with limits or friction"
         if np.any(model.geom_surfacevel) or np.any(model.geom_adhesion) or np.any(model.pair_adhesion):
             return "the model has surface velocities or adhesion"
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
-            return "the model's integrator is not Euler"
         if model.opt.disableflags & FLAGS.mjDSBL_CONSTRAINT:
             return "the model disables constraints"
         if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:

@@ -2,8 +2,8 @@
 
 mujoco-warp launches a stage for every feature that a model might have: gravity compensation, external forces, muscles with
 lengths and activations, fluids, tendons. At 4096 worlds each launch costs microseconds even if it computes nothing, which
-adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `why_not` returns the first
-feature of a model that this step does not support. The step applies external forces on bodies only if
+adds up to a fifth of a step. This step supports trees of joints with springs, dampers and motors; `SmoothDynamics.why_not`
+returns the first feature of a model that this step does not support. The step applies external forces on bodies only if
 `TorqueStep(randomized=...)` contains their name, `xfrc_applied`. It ignores `qfrc_applied`. It does not compute sensors or
 cameras, and computes poses of bodies and sites only if equality constraints need them.
 """
@@ -135,9 +135,9 @@ class TorqueStep:
     def __init__(
         self, model: mujoco.MjModel, m: Any, d: Any, randomized: Collection[str] = (), active_set: ActiveSet | None = None
     ) -> None:
-        """Prepare the launches for a `model` that this step and `ConstraintSolver` support; `m` and `d` are mujoco-warp's
-        model and data for it. `randomized` names the arrays in which worlds differ. `active_set` holds the row states of the
-        last step, if rows have keys. Warp's current device must be that of `m` and `d`.
+        """Prepare the launches for a `model` that `SmoothDynamics` and `ConstraintSolver` support; `m` and `d` are
+        mujoco-warp's model and data for it. `randomized` names the arrays in which worlds differ. `active_set` holds the row
+        states of the last step, if rows have keys. Warp's current device must be that of `m` and `d`.
         """
         self.dynamics = SmoothDynamics(model, m, d, randomized)
         self.solver = ConstraintSolver(model, m, d, damped=has_dampers(model, randomized), active_set=active_set)
@@ -147,15 +147,6 @@ class TorqueStep:
         of.nefc, of.nacon, of.ncollision, of.most_rows, of.most_contacts = d.nefc, d.nacon, d.ncollision, d.njmax, d.naconmax
         of.qpos, of.qvel, of.warmstart, of.overflow = d.qpos, d.qvel, d.qacc_warmstart, d.overflow
         self.worlds, self.joints = d.nworld, m.njnt
-
-    @staticmethod
-    def why_not(model: mujoco.MjModel, randomized: Collection[str] = ()) -> str:
-        """Return the reason why `model` is not supported, or an empty text. `randomized` names the arrays in which worlds
-        differ.
-        """
-        if model.opt.integrator != mujoco.mjtIntegrator.mjINT_EULER:
-            return "the model's integrator is not Euler"
-        return SmoothDynamics.why_not(model, randomized)
 
     def begin(self) -> None:
         """Compute the inputs of contacts and constraint rows, and all forces except constraint forces, from qpos, qvel and

@@ -19,7 +19,7 @@ from legged.physics.fields import DERIVED, FIELDS, GRAVITY, changed_arrays
 from legged.physics.fused.block_step import BlockStep
 from legged.physics.fused.constraint_solver import ConstraintSolver, ask_for_dense_rows
 from legged.physics.fused.contact_stage import ContactStage
-from legged.physics.fused.smooth_dynamics import PUSHED
+from legged.physics.fused.smooth_dynamics import PUSHED, SmoothDynamics
 from legged.physics.fused.torque_step import TorqueStep
 from legged.physics.quantities import LAST_STEP, stage_of
 from legged.physics.randomized_model import RandomizedModel, keep_centres_apart
@@ -239,7 +239,7 @@ class MujocoWarpPhysics(WarpPhysics):
             return
         per_world = (*PER_WORLD, *self._per_world, *(() if self.forces is None else (PUSHED,)))
         no_solver = ConstraintSolver.why_not(self._m, self._d)
-        self.why_library = no_solver or TorqueStep.why_not(self.model, per_world)
+        self.why_library = no_solver or SmoothDynamics.why_not(self.model, per_world)
         if step == "fused" and self.why_library:
             raise ConfigError(f"sim.step=fused: {self.why_library}; sim.step=auto uses fused parts that support the model")
         if no_solver:
