@@ -66,6 +66,9 @@ def tree_of(spec: mujoco.MjSpec, path: Path, drawn: bool = True, said: Sequence[
     _read_loops(model, tree)
     _read_apart(model, tree)
     _read_home(model, tree, path)
+    base = tree.links[0]
+    tree.turn(base.quat)  # the axes of the base's frame become parallel to the world's axes
+    base.pos, base.quat = np.zeros(3), np.array(IDENTITY)
     tree.mass = float(model.body_subtreemass[root])
     return tree
 
@@ -149,8 +152,6 @@ def _root(model: mujoco.MjModel, path: Path, tree: Tree) -> int:
     if not able:
         raise ConfigError(f"{path}: holds no robot: no body that hangs on another body has a hinge")
     root = max(able, key=lambda body: float(model.body_subtreemass[body]))
-    if model.body_subtreemass[root] <= 0.0:
-        raise ConfigError(f"{path}: body '{_name(model, root)}' and what hangs on it have no mass")
     others = [_name(model, body) for body in tops if body != root and body in model.geom_bodyid]
     on_world = int((model.geom_bodyid == 0).sum())
     if others or on_world:
@@ -170,9 +171,7 @@ def _name(model: mujoco.MjModel, body: int) -> str:
 
 
 def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, Mesh], drawn: bool) -> None:
-    """Append the links of `root` and all bodies below it. The axes of the base's frame become parallel to those of the
-    file's world.
-    """
+    """Append the links of `root` and all bodies below it."""
     places: dict[int, int] = {}
     for body in (b for b in range(1, model.nbody) if model.body_rootid[b] == root):
         link = Link(_name(model, body), -1, model.body_pos[body].copy(), model.body_quat[body].copy())
@@ -185,25 +184,11 @@ def _read_links(model: mujoco.MjModel, root: int, tree: Tree, meshes: dict[int, 
             if model.geom_bodyid[geom] == body and (shape := _shape(model, geom, link.name, meshes, tree)) is not None
             if shape.collides or drawn
         ]
-        if body == root:
-            _turn_upright(link)
-        else:
+        if body != root:
             link.parent = places[int(model.body_parentid[body])]
-            if link.parent == 0:
-                base_turn = model.body_quat[root]
-                link.pos, link.quat = rotate(base_turn, link.pos), quat_product(base_turn, link.quat)
             _read_hinges(model, body, link, tree)
         places[body] = len(tree.links)
         tree.links.append(link)
-
-
-def _turn_upright(base: Link) -> None:
-    """Turn the frame of the base about its origin, so that its axes are parallel to the world's axes."""
-    turn = matrix(base.quat)
-    base.com, base.inertia = turn @ base.com, turn @ base.inertia @ turn.T
-    for shape in base.shapes:
-        shape.move(np.zeros(3), base.quat)
-    base.pos, base.quat = np.zeros(3), np.array(IDENTITY)
 
 
 def _read_hinges(model: mujoco.MjModel, body: int, link: Link, tree: Tree) -> None:
@@ -327,11 +312,7 @@ def _read_loops(model: mujoco.MjModel, tree: Tree) -> None:
             anchors = model.site_pos[list(ids)] if sites else data[:6].reshape(2, 3)
             names = [_name(model, body) for body in bodies]
             if set(names) <= links:
-                turned = [  # anchors on the base are turned, because its frame was turned
-                    rotate(model.body_quat[body], anchor) if name == tree.links[0].name else anchor
-                    for body, name, anchor in zip(bodies, names, anchors, strict=True)
-                ]
-                ends = {"body1": names[0], "body2": names[1], "anchor": text_of(turned[0]), "anchor2": text_of(turned[1])}
+                ends = dict(zip(("body1", "body2", "anchor", "anchor2"), (*names, *map(text_of, anchors)), strict=True))
                 tree.loops.append({"tag": "connect", **ends, **solver})
                 continue
         elif kind == mujoco.mjtEq.mjEQ_JOINT:
