@@ -23,13 +23,14 @@ from legged.config import TaskConfig, has_robot
 from legged.config.networks import NETWORKS, groups_in, groups_of
 from legged.envs import BaseTask
 from legged.errors import ConfigError
-from legged.learning.recurrent import rnn_of
 from legged.learning.run_folder import FROM_LEGGED_GYM, checkpoints
 from legged.process.paths import relative, write_bytes
 from legged.robots.robot import load_robot
 
 FORMAT = 2
-"""Version of `infos`. Files that name no version (rsl-rl's, and old ones of this package) have version 1."""
+"""Version of `infos`."""
+NEEDED = ("format", "observations", "histories", "networks", "optimizer")
+"""Entries of `infos` that every checkpoint has."""
 Saved = dict[str, Any]
 
 
@@ -94,7 +95,7 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     """Return the content of a checkpoint. Check the types of its entries, and that all weights are finite.
 
     Raises:
-        ConfigError: the file is missing, is not a checkpoint, has a newer format, or is damaged.
+        ConfigError: the file is missing, is not a checkpoint of this package, has a newer format, or is damaged.
     """
     saved = load_plain(path, device)
     name = relative(path)
@@ -107,9 +108,10 @@ def read_checkpoint(path: Path, device: str = "cpu") -> Saved:
     _check_kind(f"{name}: not a checkpoint: its infos.", infos, INFOS)
     if saved["iter"] < 0:
         raise ConfigError(f"{name}: not a checkpoint: its iteration is {saved['iter']}")
-    version = infos.get("format", 1)
-    if version > FORMAT:
+    if (version := infos.get("format", FORMAT)) > FORMAT:
         raise ConfigError(f"{name}: written in format {version} by a newer legged; this one reads formats up to {FORMAT}")
+    if missing := [entry for entry in NEEDED if entry not in infos]:
+        raise ConfigError(f"{name}: not a checkpoint of this version of legged (its infos lack {', '.join(missing)})")
     for network in networks_in(saved):
         check_weights(saved[f"{network}_state_dict"], f"{name}: its {network}")
     return {**saved, "infos": infos}
@@ -267,46 +269,11 @@ def networks(cfg: TaskConfig) -> dict[str, dict[str, Any]]:
     estimating: dict[str, Any] = {"estimator.hidden_dims": list(estimator.hidden_dims) if estimator.targets else []}
     if estimator.targets:
         estimating |= {"estimator.targets": list(estimator.targets), "estimator.latent": estimator.latent}
-    groups = cfg.observations.groups
     described = {}
     for name in NETWORKS:
-        read = groups_of(cfg, name)
-        own = {"observations": list(read), "history": groups[read[0]].history}  # older versions of legged read these entries
-        hidden = list(getattr(policy, f"{name}_hidden_dims"))
-        described[name] = {"hidden_dims": hidden, **own, **shared, **({**std, **estimating} if name == "actor" else {})}
+        own = {"hidden_dims": list(getattr(policy, f"{name}_hidden_dims")), "observations": list(groups_of(cfg, name))}
+        described[name] = {**own, **shared, **({**std, **estimating} if name == "actor" else {})}
     return described
-
-
-def network_of(state: dict[str, Any]) -> dict[str, Any]:
-    """Derive the settings of a network from its weights `state`, as far as possible. Old checkpoints store no settings."""
-    hidden, estimator = (
-        [(*tensor.shape, 0)[0] for name, tensor in state.items() if name.startswith(part) and name.endswith(".weight")][:-1]
-        for part in ("mlp.", "estimator.")
-    )
-    rnn = dict(zip(("rnn_type", "rnn_hidden_dim", "rnn_num_layers"), rnn_of(state), strict=True))
-    kinds = {"scalar": "distribution.std_param", "log": "distribution.log_std_param"}
-    std: dict[str, Any] = {}
-    for kind, name in kinds.items():
-        if name in state:
-            std = {"noise_std_type": kind, "state_dependent_std": False}
-    normalises = any("obs_normalizer" in name for name in state)
-    estimating = {"estimator.hidden_dims": estimator} if estimator else {}
-    return {"hidden_dims": hidden, **estimating, "obs_normalization": normalises, **rnn, **std}
-
-
-def described_networks(saved: Saved) -> dict[str, dict[str, Any]]:
-    """Return the settings of each network in a checkpoint. Settings that are not stored are derived from the weights."""
-    said: dict[str, Any] = saved["infos"].get("networks", {})
-    return {name: {**network_of(saved[f"{name}_state_dict"]), **said.get(name, {})} for name in networks_in(saved)}
-
-
-def histories(saved: Saved) -> dict[str, int]:
-    """Return observation group -> history [steps], as far as a checkpoint tells it. In old files each network reads the group
-    that has the network's name.
-    """
-    infos = saved["infos"]
-    old = {name: said["history"] for name, said in infos.get("networks", {}).items() if "history" in said}
-    return infos.get("histories", old)
 
 
 def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
@@ -317,8 +284,7 @@ def check_fits(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     """
     name, infos = relative(path), saved["infos"]
     check_joints(name, infos.get("robot", {}), cfg)
-    layout: dict[str, dict[str, int]] = infos.get("observations", {})
-    steps = histories(saved)
+    layout, steps = infos["observations"], infos["histories"]
     for network in NETWORKS:
         for group, wanted in ((group, cfg.observations.groups[group]) for group in groups_of(cfg, network)):
             if group in layout and tuple(layout[group]) != wanted.terms:
@@ -357,25 +323,23 @@ def check_networks_fit(name: str, saved: Saved, cfg: TaskConfig) -> None:
     Raises:
         ConfigError: a network's layers, its other settings or its observation groups differ.
     """
-    described = described_networks(saved)
-    for network in described:
-        wanted = networks(cfg)[network]
-        found = {"observations": [network], "estimator.hidden_dims": [], **described[network]}
-        for key, value in wanted.items():
-            if key in found and found[key] != value and key != "history":
+    for network in networks_in(saved):
+        found = saved["infos"]["networks"].get(network, {})
+        for key, value in networks(cfg)[network].items():
+            if found.get(key) != value:
                 own = key in ("hidden_dims", "observations")
                 field = f"train.policy.{network}_{key}" if own else f"train.policy.{key}"
                 what = {"hidden_dims": "hidden layers", "observations": "the observations"}.get(key, key)
-                raise ConfigError(f"{name}: its {network} has {what} {found[key]}, the configuration has {field} {value}")
+                raise ConfigError(f"{name}: its {network} has {what} {found.get(key)}, the configuration has {field} {value}")
 
 
 def check_optimizer(path: Path, saved: Saved, cfg: TaskConfig) -> None:
-    """Check that the optimiser of a checkpoint is the configured one. A checkpoint that names no optimiser used Adam.
+    """Check that the optimiser of a checkpoint is the configured one.
 
     Raises:
         ConfigError: the two optimisers differ.
     """
-    found, wanted = saved["infos"].get("optimizer", "adam"), cfg.train.algorithm.optimizer
+    found, wanted = saved["infos"]["optimizer"], cfg.train.algorithm.optimizer
     if found != wanted:
         where = f"the configuration has train.algorithm.optimizer {wanted}"
         raise ConfigError(f"{relative(path)}: its optimiser is {found}, {where}")

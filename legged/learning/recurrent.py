@@ -1,13 +1,10 @@
-"""Hidden states of recurrent policies, and the recurrent layers in a checkpoint."""
+"""Hidden states of recurrent policies."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
-
-GATES = {4: "lstm", 3: "gru"}
-"""Number of gates of a recurrent layer (rows of the weights, divided by the layer's width) -> type of the layer."""
 
 
 def hidden_states(networks: Mapping[str, Any], num_envs: int) -> dict[str, Tensor]:
@@ -47,15 +44,6 @@ def keep_shape_of_one_robot(policy: Any) -> None:
 def parts_of(layers: torch.nn.Module) -> int:
     """Return the number of tensors in the hidden state of recurrent layers."""
     return 2 if isinstance(layers, torch.nn.LSTM) else 1
-
-
-def rnn_of(state: dict[str, Tensor]) -> tuple[str, int, int]:
-    """Return type, width and number of the recurrent layers in a model's state; ("none", 0, 0) without any."""
-    layers = [name for name in state if "weight_hh_l" in name]
-    if not layers:
-        return "none", 0, 0
-    rows, width = (*state[layers[0]].shape, 0, 0)[:2]
-    return GATES.get(rows // max(width, 1), "of no known kind"), width, len(layers)
 
 
 class Memory:

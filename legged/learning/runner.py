@@ -319,7 +319,7 @@ class Runner(OnPolicyRunner):
         saved = transferable_parts(read_checkpoint(Path(path), self.device), self.env.cfg)
         check_built(Path(path), saved, self.env)
         settings = self.env.cfg.train.algorithm
-        if saved["infos"].get("optimizer", "adam") != settings.optimizer:
+        if saved["infos"]["optimizer"] != settings.optimizer:
             saved.pop("optimizer_state_dict", None)
         self._load_learner(Path(path), saved)
         if "critic_state_dict" not in saved:

@@ -23,7 +23,6 @@ from legged.learning.checkpoint import (
     read_checkpoint,
 )
 from legged.learning.run_folder import find_checkpoint, run_config, run_named
-from legged.learning.transfer import made_for
 from legged.process.paths import exists, relative
 from legged.registry import task_class
 
@@ -74,7 +73,7 @@ def find_teacher(cfg: TaskConfig) -> Teacher:
     file = Path(name) if name.endswith(".pt") and exists(Path(name)) else None
     path = file or find_checkpoint(run_named(name, where), None)
     there, saved = run_config(path.parent), read_checkpoint(path)
-    check_joints(f"{where}: {relative(path)}", made_for(path, saved), cfg)
+    check_joints(f"{where}: {relative(path)}", saved["infos"].get("robot", {}), cfg)
     check_networks_fit(relative(path), {name: part for name, part in saved.items() if name != "critic_state_dict"}, there)
     if there.train.policy.estimator.targets:
         raise ConfigError(f"{where}: {relative(path)} has an estimator; a teacher can't have one")

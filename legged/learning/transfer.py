@@ -5,7 +5,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from legged.config import TaskConfig, has_robot
+from legged.config import TaskConfig
 from legged.config.networks import groups_of, learns_from_teacher
 from legged.envs import BaseTask
 from legged.errors import ConfigError
@@ -13,17 +13,14 @@ from legged.learning.checkpoint import (
     Saved,
     check_joints,
     check_networks_fit,
-    described_networks,
-    histories,
     networks_in,
     observation_layout,
     read_checkpoint,
 )
 from legged.learning.networks import action_std
-from legged.learning.run_folder import find_checkpoint, run_config, run_named
+from legged.learning.run_folder import find_checkpoint, run_named
 from legged.process.paths import relative
 from legged.registry import task_config
-from legged.robots.robot import load_robot
 
 OPTIMIZERS = {"adam": "Adam", "adamw": "AdamW", "sgd": "SGD", "rmsprop": "RMSprop"}
 """Optimiser's name in a configuration -> name in torch."""
@@ -57,19 +54,19 @@ def check_source(path: Path, saved: Saved, cfg: TaskConfig) -> None:
     Raises:
         ConfigError: the robot, observations or networks differ.
     """
-    saved = transferable_parts(saved, cfg)
+    saved, infos = transferable_parts(saved, cfg), saved["infos"]
     if "critic_state_dict" not in saved and not cfg.train.algorithm.critic_warmup_iterations:
         raise ConfigError(
             f"{relative(path)}: holds a policy without a value function, so a training can't begin with it"
             "; train.algorithm.critic_warmup_iterations=50 trains a new value function first"
         )
-    check_joints(relative(path), made_for(path, saved), cfg)
-    there = terms_of(path, saved)
+    check_joints(relative(path), infos.get("robot", {}), cfg)
+    there = infos["observations"]
     widths = {term: width for terms in there.values() for term, width in terms.items()}
     here = {name: dict.fromkeys(group.terms) for name, group in cfg.observations.groups.items()}
     here = {name: {term: widths.get(term) for term in terms} for name, terms in here.items()}
     steps = {name: group.history for name, group in cfg.observations.groups.items()}
-    _check_observations(path, cfg, here, there, steps, histories(saved), networks_in(saved))
+    _check_observations(path, cfg, here, there, steps, infos["histories"], networks_in(saved))
     check_networks_fit(relative(path), saved, cfg)
 
 
@@ -92,34 +89,13 @@ def check_built(path: Path, saved: Saved, task: BaseTask) -> None:
     cfg = task.cfg
     here: dict[str, Terms] = {name: {**terms} for name, terms in observation_layout(task).items()}
     steps = {name: group.history for name, group in task.observation_groups.items()}
-    _check_observations(path, cfg, here, terms_of(path, saved), steps, histories(saved), networks_in(saved))
+    there = saved["infos"]
+    _check_observations(path, cfg, here, there["observations"], steps, there["histories"], networks_in(saved))
     layers = [name for name in saved["actor_state_dict"] if name.startswith("mlp.") and name.endswith(".bias")]
     outputs = (*saved["actor_state_dict"][layers[-1]].shape, 0)[0] if layers else 0
     found = outputs // 2 if cfg.train.policy.state_dependent_std else outputs
     if found != task.num_actions:
         raise ConfigError(f"{relative(path)}: its policy gives {found} actions, but '{cfg.task}' takes {task.num_actions}")
-
-
-def made_for(path: Path, saved: Saved) -> Mapping[str, Any]:
-    """Return `name` and `joints` of a checkpoint's robot; empty if the task has no robot. If an old file lacks these
-    entries, the run's configuration gives them.
-    """
-    said: dict[str, Any] = saved["infos"].get("robot", {})
-    if "joints" in said or saved["infos"].get("format", 1) > 1:
-        return said
-    of_run = run_config(path.parent)
-    if not has_robot(of_run):
-        return {}
-    robot = load_robot(of_run.robot, of_run.origins.where("robot"))
-    return {"name": robot.name, "joints": list(robot.joint_names)}
-
-
-def terms_of(path: Path, saved: Saved) -> dict[str, Terms]:
-    """Return the terms of each observation group of a checkpoint. For old files, the run's configuration gives the terms."""
-    layout = saved["infos"].get("observations")
-    if layout is not None:
-        return layout
-    return {name: dict.fromkeys(group.terms) for name, group in run_config(path.parent).observations.groups.items()}
 
 
 def _check_observations(
@@ -166,14 +142,14 @@ def _shown(term: tuple[str, int | None] | None) -> str:
 
 def transfer_summary(path: Path, saved: Saved, actor: Any, cfg: TaskConfig, learning_rate: float) -> str:
     """Return two lines of text: the parts that were taken from a checkpoint, and the parts that begin anew."""
-    sizes = [_sizes(network) for network in described_networks(saved).values()]
+    sizes = [_sizes(saved["infos"]["networks"][network]) for network in networks_in(saved)]
     alone = len(sizes) == 1
     networks = f"actor and critic {sizes[0]}" if len({*sizes}) == 1 else f"actor {sizes[0]} and critic {sizes[-1]}"
     networks = f"actor {sizes[0]}" if alone else networks
     taken = [networks]
     if cfg.train.policy.obs_normalization:
         taken.append("observation normaliser")
-    ours, theirs = cfg.train.algorithm.optimizer, saved["infos"].get("optimizer", "adam")
+    ours, theirs = cfg.train.algorithm.optimizer, saved["infos"]["optimizer"]
     if alone:
         warmup = cfg.train.algorithm.critic_warmup_iterations
         first = f"the value function is new and learns alone for {warmup} iterations"

@@ -151,6 +151,18 @@ def test_a_newer_format_is_refused(model):
         read_checkpoint(model)
 
 
+@pytest.mark.parametrize("missing", ["format", "observations", "histories", "networks", "optimizer"])
+def test_a_checkpoint_that_does_not_describe_itself_is_refused(model, missing):
+    """As rsl-rl's own and those of early versions."""
+    infos = torch.load(model, weights_only=True)["infos"]
+    change(model, infos={name: value for name, value in infos.items() if name != missing})
+    with pytest.raises(ConfigError, match=rf"model_0\.pt: not a checkpoint of this version .*its infos lack {missing}\)"):
+        read_checkpoint(model)
+    change(model, infos=None)
+    with pytest.raises(ConfigError, match="its infos lack format, observations, histories, networks, optimizer"):
+        read_checkpoint(model)
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_weights_that_are_no_numbers_are_refused(model, value):
     saved = torch.load(model, weights_only=True)
@@ -256,25 +268,13 @@ def test_a_policy_with_normalised_observations_is_played_evaluated_and_resumed(c
     assert int(saved["actor_state_dict"]["obs_normalizer.count"]) == 2 * 4 * 4
 
 
-def test_a_checkpoint_that_does_not_say_its_sizes_is_read_by_its_weights(model):
-    from legged.learning.checkpoint import network_of
-
-    saved = torch.load(model, weights_only=True)
-    plain = {"rnn_type": "none", "rnn_hidden_dim": 0, "rnn_num_layers": 0}
-    std = {"noise_std_type": "scalar", "state_dependent_std": False}
-    assert network_of(saved["actor_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain, **std}
-    assert network_of(saved["critic_state_dict"]) == {"hidden_dims": [8], "obs_normalization": False, **plain}
-    layers = {f"mlp.{i}.weight": torch.zeros(shape) for i, shape in ((0, (16, 5)), (2, (4, 16)), (4, (2, 4)))}
-    normalised = {"obs_normalizer._mean": torch.zeros(1, 5), **layers}
-    assert network_of(normalised) == {"hidden_dims": [16, 4], "obs_normalization": True, **plain}
-
-
 def test_a_flipped_bit_is_noticed_and_an_older_checkpoint_named(tmp_path):
     """The bit is in the fraction of a weight, so the file is a checkpoint still and the weight is finite."""
     weights = torch.full((64,), 1.5)
+    infos = {"format": FORMAT, "observations": {}, "histories": {}, "networks": {}, "optimizer": "adam"}
     paths = [tmp_path / f"model_{iteration}.pt" for iteration in (3, 20, 100)]
     for path in paths:
-        torch.save({"actor_state_dict": {"w": weights}, "iter": 20}, path)
+        torch.save({"actor_state_dict": {"w": weights}, "iter": 20, "infos": infos}, path)
         assert torch.equal(read_checkpoint(path)["actor_state_dict"]["w"], weights)
     content = bytearray(paths[1].read_bytes())
     content[content.index(weights.numpy().tobytes()) + 2] ^= 1
@@ -300,7 +300,8 @@ def test_a_resumed_training_names_the_terms_whose_code_has_changed():
     folder = Path("logs") / TASK / "run"
     folder.mkdir(parents=True)
     (folder / "config.yaml").write_text(to_yaml(cfg))
-    infos = {"networks": networks(cfg), "terms": digests(Edited, cfg) | {"_reward_old": "0"}}
+    infos = {"format": FORMAT, "networks": networks(cfg), "observations": {}, "histories": {}, "optimizer": "adam"}
+    infos["terms"] = digests(Edited, cfg) | {"_reward_old": "0"}
     content = {"actor_state_dict": {}, "critic_state_dict": {}, "optimizer_state_dict": {}, "iter": 0, "infos": infos}
     torch.save(content, folder / "model_0.pt")
     assert resumed(TASK, [], None, None)[2] == ["the code of _reward_torques has changed since"]

@@ -335,11 +335,10 @@ def test_a_checkpoint_of_another_estimator_is_refused(changes, text, tmp_path):
         check_fits(path, saved, small_config(*SMALL, *changes))
 
 
-def test_a_checkpoint_that_estimates_nothing_is_refused_by_its_weights(tmp_path):
+def test_a_checkpoint_that_estimates_nothing_is_refused(tmp_path):
     path = tmp_path / "model_0.pt"
     Runner(small_task(BLIND)).save(str(path))
     saved = read_checkpoint(path)
-    del saved["infos"]["networks"]
     check_fits(path, saved, small_config(BLIND))
     with pytest.raises(ConfigError, match=r"its actor has estimator\.hidden_dims \[\], the configuration has .* \[16\]"):
         check_fits(path, saved, small_config(*SMALL))

@@ -251,36 +251,14 @@ def test_a_mirror_loss_needs_mirror_images(capsys):
         ),
     ],
 )
-@pytest.mark.parametrize("says", [True, False], ids=["described", "by its weights"])
-def test_a_checkpoint_of_other_networks_is_refused(changes, text, says, tmp_path):
+def test_a_checkpoint_of_other_networks_is_refused(changes, text, tmp_path):
     path = tmp_path / "model_0.pt"
     sizes = [("train.policy.actor_hidden_dims", [8]), ("train.policy.critic_hidden_dims", [8])]
     Runner(small_task(*sizes)).save(str(path))
     saved = read_checkpoint(path)
-    if not says:
-        del saved["infos"]["networks"]
     check_fits(path, saved, small_config(*sizes))
     with pytest.raises(ConfigError, match=text):
         check_fits(path, saved, small_config(*sizes, *changes))
-
-
-@pytest.mark.slow
-def test_a_checkpoint_from_before_groups_had_names_is_resumed(capsys):
-    folder = tiny_run(*UNLIKE)
-    path = folder / "model_1.pt"
-    saved = torch.load(path, weights_only=True)
-    infos = saved["infos"]
-    for name in ("histories", "optimizer"):
-        del infos[name]
-    for network in infos["networks"].values():
-        for name in ("observations", "noise_std_type", "state_dependent_std"):
-            network.pop(name, None)
-    torch.save(saved, path)
-    resumed = tiny_run("--resume", "--load_run", str(folder), iterations=3)
-    assert max(checkpoints(resumed)) == 2
-    capsys.readouterr()
-    assert call(train.main, [*BASE, "--resume", "--load_run", str(folder), "observations.groups.actor.history=3"]) == 2
-    assert "its actor has history 2, the configuration has observations.groups.actor.history 3" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from legged.cli.play import play
 from legged.cli.train import train
 from legged.errors import ConfigError
 from legged.learning.checkpoint import check_fits, read_checkpoint
-from legged.learning.recurrent import rnn_of
 from legged.learning.run_folder import run_config
 from legged.learning.runner import Runner
 from legged.policies.actor import Actor
@@ -48,7 +47,8 @@ def flags(kind: str) -> list[str]:
 def test_a_recurrent_policy_is_trained_resumed_played_and_exported(kind, capsys):
     folder = tiny_run(*flags(kind))
     saved = read_checkpoint(folder / "model_1.pt")
-    assert rnn_of(saved["actor_state_dict"]) == rnn_of(saved["critic_state_dict"]) == (kind, 6, 2)
+    for network in saved["infos"]["networks"].values():
+        assert (network["rnn_type"], network["rnn_hidden_dim"], network["rnn_num_layers"]) == (kind, 6, 2)
     assert run_config(folder).train.policy.rnn_type == kind
 
     resumed = tiny_run(*flags(kind), "--resume", "--load_run", str(folder), iterations=3)

@@ -124,7 +124,7 @@ def test_a_full_disk_is_seen_before_anything_is_built(room, monkeypatch, capsys)
 
 
 def test_a_full_disk_at_a_checkpoint_is_called_that(monkeypatch):
-    from legged.learning.checkpoint import read_checkpoint, write_checkpoint
+    from legged.learning.checkpoint import load_plain, write_checkpoint
 
     saved = {"actor_state_dict": {}, "critic_state_dict": {}, "iter": 3, "extra": torch.zeros(9)}
     write_checkpoint(Path("model_3.pt"), saved)
@@ -137,7 +137,7 @@ def test_a_full_disk_at_a_checkpoint_is_called_that(monkeypatch):
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(RunError, match=r"model_3\.pt: no space left on the disk"):
         write_checkpoint(Path("model_3.pt"), {**saved, "iter": 4})
-    assert read_checkpoint(Path("model_3.pt"))["iter"] == 3
+    assert load_plain(Path("model_3.pt"))["iter"] == 3
     assert [path.name for path in Path.cwd().iterdir()] == ["model_3.pt"]
 
 

@@ -254,14 +254,8 @@ def test_another_robots_joints_are_refused(capsys):
     assert "made for another robot: 'anymal_c' with 2 joints" in error
 
 
-def test_a_checkpoint_that_says_nothing_of_itself_is_compared_by_its_runs_configuration(capsys):
+def test_a_folder_without_a_configuration_is_no_run(capsys):
     source = tiny_run()
-    saved = content(source, 1)
-    saved["infos"] = {"learning_rate": saved["infos"]["learning_rate"]}
-    torch.save(saved, source / "model_1.pt")
-    assert "(no task named, iteration 1): actor and critic (8)" in said(capsys, str(source))
-    error = refused(capsys, "--transfer", str(source), f"observations.groups.actor.terms=[{TERMS}]")
-    assert "actor: term 7 is none here, 'actions' there" in error
     Path("elsewhere").mkdir()
     shutil.copy(source / "model_1.pt", "elsewhere")
     assert "--transfer: 'elsewhere' holds no run" in refused(capsys, "--transfer", "elsewhere")
