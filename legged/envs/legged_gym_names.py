@@ -357,7 +357,7 @@ class LeggedGymNames:
                 except AttributeError as error:
                     raise AttributeError(f"self.{name}: {error}") from None
             near = None if name.startswith("_") else self._nearest(name)
-            hint = f"did you mean '{near}'?" if near else _OWN
+            hint = f"did you mean '{near}'?" if near else f"paste it too if it is a method; {_OWN}"
             raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'; {hint}")
 
     def _nearest(self, name: str) -> str | None:

@@ -329,6 +329,7 @@ def test_a_slip_of_the_pen_has_its_nearest_name(task):
         ("last_foot_vel", None),  # last_dof_vel is something else
         ("ref_dof_pos", None),  # and so is dof_pos
         ("edge_reset_buf", None),
+        ("_stance_of_feet", None),
     ],
 )
 def test_only_what_can_be_read_and_is_like_it_is_proposed(task, slip, near):
@@ -337,7 +338,7 @@ def test_only_what_can_be_read_and_is_like_it_is_proposed(task, slip, near):
     proposed = re.search("did you mean '(.*)'", str(error.value))
     assert (proposed and proposed[1]) == near
     assert near or str(error.value).endswith(
-        "allocate your own tensors in _init_buffers(), and write them in place in advance()"
+        "; paste it too if it is a method; allocate your own tensors in _init_buffers(), and write them in place in advance()"
     )
 
 
