@@ -170,6 +170,7 @@ def _command_ranges(task: Any) -> dict[str, Any]:
 
 
 PLAIN: dict[str, Callable[[Any], Any]] = {
+    "env": lambda task: task,  # walk-these-ways has its rewards in another class, which reads self.env.dof_pos
     "num_dof": lambda task: task.robot.num_dof,
     "num_dofs": lambda task: task.robot.num_dof,
     "dof_names": lambda task: list(task.robot.joint_names),

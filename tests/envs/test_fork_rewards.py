@@ -110,6 +110,10 @@ class Fork(LeggedRobot):
     def _reward_torque_change(self):
         return torch.sum(torch.square(self.torques - self.last_torques), dim=1)
 
+    def _reward_sliding_of_env(self):
+        sliding = self.env.last_contacts * self.env.cfg.rewards.tracking_sigma
+        return torch.sum(sliding * self.env.foot_velocities.norm(dim=2), dim=1)
+
     def _reward_fell(self):
         return self.reset_buf * ~self.time_out_buf
 

@@ -76,6 +76,7 @@ def test_names_mean_what_they_mean_there(task):
     assert task.height_points[2, :, :2].equal(task.height_scan.points)
     torch.testing.assert_close(quat_rotate_inverse(task.base_quat, task.gravity_vec), task.projected_gravity)
     assert task.command_ranges["lin_vel_x"].tolist() == task.command_sampler.ranges[0].tolist()
+    assert task.env is task
     assert task.base_position is task.base_pos
     assert task.penalized_contact_indices is task.penalised_indices
     assert task.raw_default_dof_pos is task.default_joint_pd_target is task.default_dof_pos
