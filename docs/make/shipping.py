@@ -68,12 +68,15 @@ def ship(runs: Sequence[Record], folder: Path) -> list[str]:
 
 
 def _small(checkpoint: Path) -> memoryview:
-    """Return a checkpoint's file without the state of the optimiser, made smaller as `LARGEST` says.
+    """Return a checkpoint's file without the state of the optimiser, made smaller as `LARGEST` says. Files that the training
+    began with are named without their folders.
 
     Raises:
         ConfigError: the checkpoint can't be read.
     """
     saved = read_checkpoint(checkpoint)
+    for source in (saved["infos"][key] for key in ("teacher", "transferred_from") if key in saved["infos"]):
+        source["file"] = Path(source["file"]).name
     actor = saved["actor_state_dict"]
     large = {name for name, value in actor.items() if value.is_floating_point() and value.numel() > FEW}
     small = {name: value.half() if name in large else value for name, value in actor.items()}

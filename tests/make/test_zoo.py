@@ -279,6 +279,16 @@ def test_weights_of_a_large_actor_are_shipped_in_float16():
     assert {value.dtype for name, value in actor.items() if value.numel() <= FEW} == {torch.float32}
 
 
+def test_a_shipped_policy_names_no_folder_of_the_machine_that_trained_it():
+    run = read_record(run_of_seed(1))
+    saved = torch.load(run.folder / "model_0.pt", weights_only=True)
+    saved["infos"]["teacher"] = {"file": "/home/me/runs/model_9.pt", "task": TASK, "iteration": 9}
+    torch.save(saved, run.folder / "model_0.pt")
+    ship([run], Path("shipped"))
+    teacher = torch.load(Path("shipped") / TASK / "model.pt", weights_only=True)["infos"]["teacher"]
+    assert teacher == {"file": "model_9.pt", "task": TASK, "iteration": 9}
+
+
 def test_of_several_seeds_the_lowest_gives_the_policy_and_the_others_what_they_came_to():
     for seed in (2, 1, 1):
         folder = run_of_seed(seed)
