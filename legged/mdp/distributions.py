@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from legged.config.randomization import DrawConfig
-from legged.mdp.kernels import Kernels
 from legged.mdp.random_pool import RandomPool, Slice
 
 KINDS = ("uniform", "log_uniform", "gaussian")
@@ -62,23 +61,6 @@ class Distributions:
         self._neutral = tensor(neutral)
         if within:
             self._neutral = torch.minimum(torch.maximum(self._neutral, self._least), self._most)
-        self.table, self.source = self._table(columns)
-        """(V, 8) parameters of each column and (V,) index of its uniform number, for the kernel."""
-
-    def _table(self, columns: Sequence[DrawConfig]) -> tuple[Tensor, Tensor]:
-        """Return the table of parameters (V, 8) and the index of each column's uniform number (V,).
-
-        A row holds: the distribution's index in `KINDS`; middle and spread of a normal distribution, else 0; both ends of the
-        range; its widening in a step and its width at the first step, as shares of its full width; the neutral value.
-        """
-        count, like = len(columns), self.low
-        source = torch.tensor([self._order.index(i) for i in range(count)], device=like.device)
-        middle, spread = torch.zeros(2, count, device=like.device)
-        of_normal = [i for i in self._order if columns[i].distribution == "gaussian"]
-        middle[of_normal], spread[of_normal] = self._middle, self._spread
-        kind = torch.tensor([float(KINDS.index(draw.distribution)) for draw in columns], device=like.device)
-        pace, first = self._pace or (torch.zeros_like(kind), torch.ones_like(kind))
-        return torch.stack([kind, middle, spread, self._least, self._most, pace, first, self._neutral], dim=1), source
 
     def ask(self, numbers: RandomPool) -> Slice:
         """Reserve in the pool `numbers` the uniform numbers that `values` takes."""
@@ -88,13 +70,6 @@ class Distributions:
         """Draw (count, V) numbers at once, without the pool of a control step. Ranges that widen have their initial width."""
         even = self.low + torch.rand(count, len(self.low), device=self.low.device) * (self.high - self.low)
         return self.values(even, torch.zeros((), device=even.device))
-
-    def write(self, even: Tensor, steps: Tensor, out: Tensor, kernels: Kernels | None) -> None:
-        """Write into `out` (N, V) what `values` would return, by one launch if `kernels` are given."""
-        if kernels is None:
-            out.copy_(self.values(even, steps))
-        else:
-            kernels.launch("make_draws", tuple(out.shape), even, self.source, self.table, steps.view(1), out)
 
     def values(self, even: Tensor, steps: Tensor) -> Tensor:
         """Return (N, V) random numbers made from the uniform numbers `even` (N, V), which lie between `low` and `high`.

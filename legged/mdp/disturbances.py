@@ -226,7 +226,7 @@ class Disturbances:
         there are no disturbances.
         """
         if self._all:
-            self._draws.write(self._even.values, self.steps, self._drawn, self._kernels)
+            self._drawn.copy_(self._draws.values(self._even.values, self.steps))
             for force in self.forces.values():
                 force.turn()
 

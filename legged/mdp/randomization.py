@@ -142,7 +142,7 @@ class Randomization:
                 place.append(starts[name] + k if kind else 0)
                 moment.append(kind)
         self._place, self._moment = (torch.tensor(values, device=device) for values in (place, moment))
-        self._fresh, self._none = torch.zeros_like(self.drawn), torch.zeros(1, 1, device=device)
+        self._fresh = torch.zeros_like(self.drawn)
         self._due = torch.zeros(worlds, 2 + len(intervals), dtype=torch.bool, device=device)
         self._any_due, self._chosen_due = torch.zeros(2, worlds, dtype=torch.bool, device=device)
         self._kernels = kernels
@@ -167,13 +167,6 @@ class Randomization:
         parts of the step.
         """
         if not self.redrawn:
-            return
-        if self._kernels is not None:
-            even = (self._even or self._choice).values  # type: ignore[union-attr]
-            choice, variants = (even, self._none) if self._choice is None else (self._choice.values, self.variants)
-            source, table = (self._place[:0], self._none[:0]) if self._own is None else (self._own.source, self._own.table)
-            made_of = even, source, table, self.steps.view(1), self._place, choice, variants
-            self._kernels.launch("make_fresh", tuple(self._fresh.shape), *made_of, self._new_chosen, self._fresh)
             return
         parts = []
         if self._own is not None and self._even is not None:

@@ -14,7 +14,6 @@ from legged.mdp.command_curriculum import CommandCurriculum
 from legged.mdp.commands import Commands
 from legged.mdp.contacts import FeetContacts
 from legged.mdp.control import Control
-from legged.mdp.distributions import Distributions
 from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.kernels.task import TaskKernels
@@ -254,25 +253,6 @@ def test_the_control_law_varies_alike_and_keeps_what_was_drawn_at_the_start():
     for name in ("stiffness", "damping", "torque_limits", "_lowest_torques", "zero_dof_pos"):
         torch.testing.assert_close(*(getattr(law, name) for law in laws), rtol=0.0, atol=0.0)
     torch.testing.assert_close(laws[1].stiffness, drawn["p_gain"][:, None] * torch.as_tensor(robot.stiffness).float())
-
-
-def test_numbers_of_all_distributions_are_made_alike():
-    """Exponentials and normal ones but for their last bits; on the way from a value that is neutral too."""
-    columns = [
-        DrawConfig((1.0, 2.0), distribution="gaussian", grow=(0.0, 10.0)),
-        DrawConfig((3.0, 4.0), grow=(2.0, 4.0)),
-        DrawConfig((5.0, 60.0), distribution="log_uniform"),
-        DrawConfig((7.0, 8.0), distribution="gaussian", std=0.1),
-    ]
-    draws = Distributions(columns, [1.0, 0.0, 5.0, 7.5], CPU, 24)
-    even = draws.low + torch.rand(N, 4) * (draws.high - draws.low)
-    for iteration in (0.0, 1.0, 2.5, 3.5, 20.0):
-        steps, found = torch.tensor(24.0 * iteration), torch.zeros(2, N, 4)
-        for out, kernels in zip(found, (None, TaskKernels(nullcontext)), strict=True):
-            draws.write(even, steps, out, kernels)
-        torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=0.0)
-        torch.testing.assert_close(found[0], draws.values(even, steps), rtol=0.0, atol=0.0)
-    assert found[0].std(dim=0).min() > 0.05
 
 
 @pytest.mark.parametrize("of", ["kicks and forces", "kicks", "forces"])

@@ -47,60 +47,6 @@ def find_moments(
         steps[0] = steps[0] + 1.0
 
 
-@wp.func
-def drawn_value(even: float, column: int, table: wp.array2d[float], steps: float) -> float:
-    """Convert a uniform number to a value from the distribution in row `column` of `Distributions.table`."""
-    value = even
-    kind = table[column, 0]
-    if kind > 0.0:
-        value = wp.where(kind == 1.0, wp.exp(even), wp.erfinv(even) * table[column, 2] + table[column, 1])
-        value = wp.min(wp.max(value, table[column, 3]), table[column, 4])
-    share = wp.min(wp.max(table[column, 6] + table[column, 5] * steps, 0.0), 1.0)
-    neutral = table[column, 7]
-    if share < 0.5:
-        return neutral + share * (value - neutral)
-    return value - (value - neutral) * (1.0 - share)
-
-
-@wp.kernel
-def make_draws(
-    even: wp.array2d[float],
-    source: wp.array[wp.int64],
-    table: wp.array2d[float],
-    steps: wp.array[float],
-    drawn: wp.array2d[float],
-):
-    """Compute random values from uniform numbers (`Distributions.values`). One thread per robot and column."""
-    robot, column = wp.tid()
-    drawn[robot, column] = drawn_value(even[robot, int(source[column])], column, table, steps[0])
-
-
-@wp.kernel
-def make_fresh(
-    even: wp.array2d[float],
-    source: wp.array[wp.int64],
-    table: wp.array2d[float],
-    steps: wp.array[float],
-    place: wp.array[wp.int64],
-    choice: wp.array2d[float],
-    variants: wp.array2d[float],
-    chosen: wp.array[wp.int64],
-    fresh: wp.array2d[float],
-):
-    """Compute new random values, and choose model variants (`Randomization.draw`). One thread per robot and column. A column
-    whose `place` is beyond the end of `table` takes its value from the chosen variant.
-    """
-    robot, column = wp.tid()
-    variant = wp.clamp(int(choice[robot, 0]), 0, variants.shape[0] - 1)
-    if column == 0:
-        chosen[robot] = wp.int64(variant)
-    at = int(place[column])
-    if at < table.shape[0]:
-        fresh[robot, column] = drawn_value(even[robot, int(source[at])], at, table, steps[0])
-    else:
-        fresh[robot, column] = variants[variant, at - table.shape[0]]
-
-
 @wp.kernel
 def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.array2d[float], drawn: wp.array2d[float]):
     """Copy new random values to the robots that are due (`Randomization.redraw`). One thread per robot and column."""

@@ -18,8 +18,6 @@ from legged.mdp.kernels.random import (
     advance_map,
     disturb,
     find_moments,
-    make_draws,
-    make_fresh,
     take_fresh,
     vary_control,
 )
@@ -339,7 +337,7 @@ KERNELS = {
     kernel.key: kernel
     for kernel in (
         *(hold_joints, drive_joints, run_mlp, run_lstm, advance_feet, renew_commands, find_pushes, follow_commands),
-        *(make_draws, make_fresh, find_moments, take_fresh, vary_control, disturb, advance_map, widen_commands),
+        *(find_moments, take_fresh, vary_control, disturb, advance_map, widen_commands),
         *(scan_heights, read_bodies, move_levels, add_rewards),
     )
 }
