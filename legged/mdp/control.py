@@ -111,19 +111,10 @@ class Control:
             return
         if not self._varied:
             self._varied = True
-            self._nominal_law = torch.stack([*self.nominal.values(), self.default_dof_pos])
-            one = torch.ones_like(self.torques[:1])
-            self._factors = {**dict.fromkeys(self.nominal, one), "joint_offset": torch.zeros_like(one)}
             self.stiffness, self.damping, self.torque_limits, self._lowest_torques = (
                 torch.zeros_like(self.torques) + nominal for nominal in (*self.nominal.values(), self._lowest_torques)
             )
             self.zero_dof_pos = torch.zeros_like(self.torques) + self.default_dof_pos
-        if self._kernels is not None:
-            self._factors |= each
-            wide = (values.expand_as(self.torques) for values in self._factors.values())
-            law = (self.stiffness, self.damping, self.torque_limits, self._lowest_torques, self.zero_dof_pos)
-            self._kernels.launch("vary_control", tuple(self.torques.shape), *wide, self._nominal_law, *law)
-            return
         written = {"p_gain": self.stiffness, "d_gain": self.damping, "torque_limit": self.torque_limits}
         for name, values in each.items():
             if name in written:

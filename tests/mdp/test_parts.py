@@ -341,6 +341,16 @@ def test_position_control_by_hand():
     assert torques[0, 9:].tolist() == pytest.approx([0.0, -8.0, 24.0])
 
 
+def test_gains_vary_by_robot_and_properties_drawn_at_the_start_stay():
+    law = control("P")
+    law.vary({"p_gain": torch.tensor([0.5, 2.0]), "torque_limit": torch.full((2, 12), 0.25)})
+    law.vary({"d_gain": torch.tensor([[1.5], [0.0]])})
+    assert law.stiffness[:, :3].flatten().tolist() == [5.0, 10.0, 15.0, 20.0, 40.0, 60.0]
+    assert law.damping[:, :3].flatten().tolist() == [3.0, 4.5, 6.0, 0.0, 0.0, 0.0]
+    law.set_actions(rows(10.0, 10.0, 10.0))
+    assert law.compute(rows(0.0, 0.0, 0.0), rows(-1.0, 0.0, 0.0))[:, 0].tolist() == [20.0, 20.0]  # a quarter of 80 N m
+
+
 def test_velocity_control_by_hand_remembers_the_last_velocity_and_forgets_it_at_a_reset():
     law = control("V")
     law.set_actions(rows(2.0, 0.0, -2.0))

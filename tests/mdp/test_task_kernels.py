@@ -242,19 +242,6 @@ def test_numbers_are_drawn_again_alike(chosen):
     assert parts[1].steps == 20.0
 
 
-def test_the_control_law_varies_alike_and_keeps_what_was_drawn_at_the_start():
-    robot = load_robot("anymal_c")
-    laws = pair(lambda kernels: Control(robot, RobotControlConfig(), torch.zeros(N, 12), 0.005, kernels))
-    drawn = {"p_gain": 0.5 + torch.rand(N), "torque_limit": 0.5 + torch.rand(N, 12), "joint_offset": 0.1 * torch.rand(N, 12)}
-    again = {"d_gain": 0.5 + torch.rand(N, 1)}
-    for law in laws:
-        law.vary(drawn)
-        law.vary(again)
-    for name in ("stiffness", "damping", "torque_limits", "_lowest_torques", "zero_dof_pos"):
-        torch.testing.assert_close(*(getattr(law, name) for law in laws), rtol=0.0, atol=0.0)
-    torch.testing.assert_close(laws[1].stiffness, drawn["p_gain"][:, None] * torch.as_tensor(robot.stiffness).float())
-
-
 @pytest.mark.parametrize("of", ["kicks and forces", "kicks", "forces"])
 def test_kicks_and_forces_come_and_end_alike(of):
     """Two of each: what a robot gets of two kicks at once is their sum, and so are two forces on one body."""

@@ -56,35 +56,6 @@ def take_fresh(due: wp.array2d[wp.bool], moment: wp.array[wp.int64], fresh: wp.a
 
 
 @wp.kernel
-def vary_control(
-    p_gain: wp.array2d[float],
-    d_gain: wp.array2d[float],
-    torque_limit: wp.array2d[float],
-    offset: wp.array2d[float],
-    nominal: wp.array2d[float],
-    stiffness: wp.array2d[float],
-    damping: wp.array2d[float],
-    highest: wp.array2d[float],
-    lowest: wp.array2d[float],
-    zero: wp.array2d[float],
-):
-    """Compute randomised gains, torque limits and joint offsets (`Control.vary`). One thread per robot and joint. `nominal`
-    holds stiffness, damping, torque limit and default angle of each joint.
-    """
-    robot, joint = wp.tid()
-    # All reads precede all writes, so that reads wait for memory together. The compiler moves no read ahead of a write.
-    p = nominal[0, joint] * p_gain[robot, joint]
-    d = nominal[1, joint] * d_gain[robot, joint]
-    most = nominal[2, joint] * torque_limit[robot, joint]
-    middle = nominal[3, joint] - offset[robot, joint]
-    stiffness[robot, joint] = p
-    damping[robot, joint] = d
-    highest[robot, joint] = most
-    lowest[robot, joint] = -most
-    zero[robot, joint] = middle
-
-
-@wp.kernel
 def disturb(
     mask: wp.array[wp.bool],
     drawn: wp.array2d[float],
@@ -129,7 +100,8 @@ def disturb(
     pushed = wp.vec3()
     for k in range(bodies.shape[0]):
         if bodies[k] == body:
-            # All reads precede all writes, as in `vary_control`.
+            # All reads precede all writes, so that reads wait for memory together. The compiler moves no read ahead of a
+            # write.
             at = 7 * kicks + 5 * k
             lasting, pause = left[robot, 2 * k] - dt, left[robot, 2 * k + 1] - dt
             now = wp.vec3(force[robot, 3 * k], force[robot, 3 * k + 1], force[robot, 3 * k + 2])

@@ -14,13 +14,7 @@ from torch import Tensor
 from legged.mdp.kernels.actuator import drive_joints
 from legged.mdp.kernels.bodies import read_bodies
 from legged.mdp.kernels.network import run_lstm, run_mlp
-from legged.mdp.kernels.random import (
-    advance_map,
-    disturb,
-    find_moments,
-    take_fresh,
-    vary_control,
-)
+from legged.mdp.kernels.random import advance_map, disturb, find_moments, take_fresh
 
 PI = wp.constant(wp.float32(torch.pi))
 
@@ -337,7 +331,7 @@ KERNELS = {
     kernel.key: kernel
     for kernel in (
         *(hold_joints, drive_joints, run_mlp, run_lstm, advance_feet, renew_commands, find_pushes, follow_commands),
-        *(find_moments, take_fresh, vary_control, disturb, advance_map, widen_commands),
+        *(find_moments, take_fresh, disturb, advance_map, widen_commands),
         *(scan_heights, read_bodies, move_levels, add_rewards),
     )
 }
