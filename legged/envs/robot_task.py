@@ -122,7 +122,7 @@ class RobotTask(RobotTerms, BaseTask):
         self.contact_forces = state.contact_forces
         self.last_dof_vel = torch.zeros_like(self.dof_vel)
 
-        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, kernels, self.numbers)
+        self.pushes = Pushes(cfg.domain_rand, n, self.dt, device, self.numbers)
         steps = cfg.train.runner.num_steps_per_env
         walk = cfg.domain_rand.held_goals
         goals = HeldGoals(walk, robot, cfg.control, n, self.dt, device, cfg.origins.where) if walk.step else None

@@ -260,29 +260,20 @@ class Pushes:
         num_envs: int,
         dt: float,
         device: torch.device,
-        kernels: Kernels | None = None,
         numbers: RandomPool | None = None,
     ) -> None:
         """Draw the times of the first pushes, between 0 and one interval. `dt` is the control step [s]. Velocities are drawn
         from the pool `numbers`.
         """
-        self.cfg, self.dt, self._kernels = cfg, dt, kernels
+        self.cfg, self.dt = cfg, dt
         self.push_time_left = uniform(0.0, cfg.push_interval_s, (num_envs,), device)
         """(N,) time until the next push [s]."""
         self.numbers = numbers or RandomPool(num_envs, device)
         self._velocity = self.numbers.between(-cfg.max_push_vel_xy, cfg.max_push_vel_xy, 2)
-        self._due = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._delta = torch.zeros(num_envs, 2, device=device)
 
     def push(self, physics: Physics, mask: Tensor) -> None:
         """Push the robots in `mask` (N,) that are due: their base gets the drawn horizontal velocity, in the world frame."""
         if not self.cfg.push_robots:
-            return
-        if self._kernels is not None:
-            times = (self.dt, 0.5 * self.dt, self.cfg.push_interval_s)
-            found = (self.push_time_left, self._due, self._delta)
-            self._kernels.launch("find_pushes", len(mask), mask, self._velocity.values, physics.qvel, *times, *found)
-            physics.push(self._due, self._delta)
             return
         self.push_time_left.sub_(self.dt)
         due = (self.push_time_left <= 0.5 * self.dt) & mask

@@ -18,7 +18,7 @@ from legged.mdp.disturbances import Disturbances
 from legged.mdp.height_map_errors import HeightMapErrors
 from legged.mdp.kernels.task import TaskKernels
 from legged.mdp.random_pool import RandomPool
-from legged.mdp.randomization import Pushes, Randomization
+from legged.mdp.randomization import Randomization
 from legged.mdp.rewards import Rewards
 from legged.mdp.sensors import HeightScan
 from legged.mdp.terrain_curriculum import TerrainCurriculum
@@ -147,30 +147,6 @@ def test_robots_move_between_levels_alike():
         torch.testing.assert_close(parts[0].origins, parts[1].origins, rtol=0.0, atol=0.0)
         torch.testing.assert_close(parts[0].way, parts[1].way)
     assert parts[0]._sums[1:].sum(dim=1).min() > 10.0
-
-
-class Velocities:
-    """The part of a physics engine that is pushed."""
-
-    def __init__(self) -> None:
-        self.qvel = torch.full((N, 18), 0.3)
-
-    def push(self, mask: torch.Tensor, delta: torch.Tensor) -> None:
-        self.qvel[:, :2] += torch.where(mask.view(-1, 1), delta, 0.0)
-
-
-def test_robots_are_pushed_alike():
-    cfg = replace(RobotDomainRandConfig(), push_interval_s=0.3)
-    parts, worlds = pair(lambda kernels: Pushes(cfg, N, DT, CPU, kernels)), (Velocities(), Velocities())
-    for step in range(40):
-        mask = chance(0.9, N)
-        for part, world in zip(parts, worlds, strict=True):
-            torch.manual_seed(step)
-            part.numbers.draw()
-            part.push(world, mask)
-        assert_same(parts)
-        assert worlds[0].qvel.equal(worlds[1].qvel)
-    assert worlds[0].qvel.unique().numel() > N
 
 
 @pytest.mark.parametrize("only_positive", [False, True])

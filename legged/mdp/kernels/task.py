@@ -115,30 +115,6 @@ def renew_commands(
 
 
 @wp.kernel
-def find_pushes(
-    mask: wp.array[wp.bool],
-    velocity: wp.array2d[float],
-    qvel: wp.array2d[float],
-    dt: float,
-    last_moment: float,
-    interval: float,
-    time_left: wp.array[float],
-    due: wp.array[wp.bool],
-    delta: wp.array2d[float],
-):
-    """Find the robots that are pushed now, and their changes of velocity (`Pushes.push`). One thread per robot."""
-    robot = wp.tid()
-    left = time_left[robot] - dt
-    now = left <= last_moment and mask[robot]
-    if now:
-        left = interval
-    time_left[robot] = left
-    due[robot] = now
-    for i in range(2):
-        delta[robot, i] = velocity[robot, i] - qvel[robot, i]
-
-
-@wp.kernel
 def follow_commands(
     commands: wp.array2d[float],
     lin_vel: wp.array2d[float],
@@ -330,7 +306,7 @@ def add_rewards(
 KERNELS = {
     kernel.key: kernel
     for kernel in (
-        *(hold_joints, drive_joints, run_mlp, run_lstm, advance_feet, renew_commands, find_pushes, follow_commands),
+        *(hold_joints, drive_joints, run_mlp, run_lstm, advance_feet, renew_commands, follow_commands),
         *(find_moments, take_fresh, disturb, advance_map, widen_commands),
         *(scan_heights, read_bodies, move_levels, add_rewards),
     )
