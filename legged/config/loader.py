@@ -216,8 +216,8 @@ def robot_path(robot: Any, folder: Path) -> Any:
 
 def file_paths(section: Any, folder: Path) -> None:
     """Make the paths of a learned actuator and of reference motions in `section` absolute. A path is relative to `folder`,
-    the folder of the configuration file. If no such file exists there, the path is relative to the working directory, or for
-    a motion to resources/motions.
+    the folder of the configuration file. If no such file exists there, the path is relative to the working directory. Names
+    of motions under resources/motions/ are kept, so that runs can be moved to another installation.
     """
     control, motion = (section.get(key) if isinstance(section, Mapping) else None for key in ("control", "motion"))
     actuator = control.get("actuator") if isinstance(control, Mapping) else None
@@ -227,8 +227,8 @@ def file_paths(section: Any, folder: Path) -> None:
     files = motion.get("files") if isinstance(motion, dict) else None
     if isinstance(motion, dict) and isinstance(files, list | tuple) and all(name and isinstance(name, str) for name in files):
         places = (folder, Path.cwd(), data_folder("resources") / "motions")
-        found = [next((place / name for place in places if exists(place / name)), folder / name) for name in files]
-        motion["files"] = [str(path.absolute()) for path in found]
+        found = [next((place / name for place in places if exists(place / name)), folder / name).absolute() for name in files]
+        motion["files"] = [str(path.relative_to(places[2]) if path.is_relative_to(places[2]) else path) for path in found]
 
 
 def parse_override(text: str) -> tuple[str, Any]:

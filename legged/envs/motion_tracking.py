@@ -4,7 +4,6 @@
 At the end of a control step, a robot should have reached its frame of the motion. Observations show the frame after it.
 """
 
-from pathlib import Path
 from typing import Any, ClassVar, TypeGuard
 
 import torch
@@ -301,5 +300,5 @@ def is_tracking_task(task: BaseTask) -> TypeGuard[MotionTracking]:
 def _clips(cfg: TrackingConfig, skeleton: Skeleton) -> list[Clip]:
     """Return the clips of a task, at its control rate."""
     motion = cfg.motion
-    files = motion_files([Path(name) for name in motion.files], cfg.origins.where("motion.files"))
+    files = motion_files(motion.files, cfg.origins.where("motion.files"))
     return [read_clip(file, skeleton, motion.csv_fps).resampled(round(1.0 / cfg.dt, 6)) for file in files]

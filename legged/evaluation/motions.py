@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -44,8 +43,8 @@ def evaluate_motions(setting: Setting, episodes: int) -> int:
     start, cfg = time.perf_counter(), setting.cfg
     head = {**setting.head, **setting.changes}
     measured, lost = {}, 0
-    files, where = [Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files")
-    files = motion_files(files, where)
+    where = cfg.origins.where("motion.files")
+    files = motion_files(cfg.motion.files, where)
     for name in {file.stem for file in files}:
         if sum(file.stem == name for file in files) > 1:
             raise ConfigError(f"{where}: two motions are named '{name}'; evaluate them one after the other")

@@ -13,7 +13,7 @@ import numpy as np
 from legged.errors import ConfigError, suggest
 from legged.motion.clip import Clip, make_clip
 from legged.motion.kinematics import Skeleton
-from legged.process.paths import exists, relative
+from legged.process.paths import data_folder, exists, relative
 
 ROOT = 7
 """Columns of the root: position and quaternion."""
@@ -41,14 +41,15 @@ def read_clip(path: Path, skeleton: Skeleton, csv_fps: float = CSV_FPS) -> Clip:
         raise ConfigError(f"{where}: can't be read as a motion ({error})") from error
 
 
-def motion_files(paths: Sequence[Path], where: str) -> list[Path]:
-    """Return the files of motions among `paths`, and those in the folders among them. Error messages begin with `where`.
+def motion_files(names: Sequence[str], where: str) -> list[Path]:
+    """Return the files of motions among `names`, and those in the folders among them. A relative path is relative to
+    resources/motions. Error messages begin with `where`.
 
     Raises:
         ConfigError: there is no motion, or a path is neither a file nor a folder with one.
     """
     files: list[Path] = []
-    for path in paths:
+    for path in (data_folder("resources") / "motions" / name for name in names):
         is_folder = exists(path) and path.is_dir()
         found = sorted(file for file in path.rglob("*") if file.suffix in READERS) if is_folder else [path]
         if not found or not exists(found[0]):

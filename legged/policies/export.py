@@ -52,7 +52,7 @@ def megabytes(cfg: TaskConfig) -> float:
     """
     if not tracks_motions(cfg):
         return POLICY_MB
-    clips = motion_files([Path(name) for name in cfg.motion.files], cfg.origins.where("motion.files"))
+    clips = motion_files(cfg.motion.files, cfg.origins.where("motion.files"))
     return POLICY_MB + TRACKER_MB * len(clips)
 
 

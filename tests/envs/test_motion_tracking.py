@@ -13,6 +13,7 @@ from legged.errors import ConfigError
 from legged.evaluation import motions
 from legged.math import quat_from_angle_axis, quat_multiply, quat_rotate
 from legged.motion.clip import Clip, make_clip, write_clip
+from legged.process.paths import data_folder
 from legged.registry import make_task, register_file, task_config
 from legged.robots.robot import load_robot
 
@@ -301,6 +302,14 @@ def test_a_tracker_is_trained_and_plays(capsys):
     assert [part["second"] for part in parts] == list(range(6))
     assert min(part["body_error"] for part in parts) < squat["body_error"] < max(part["body_error"] for part in parts)
     assert all(part["body_error"] < part["largest_error"] for part in parts)
+
+
+def test_packaged_motions_keep_their_names_and_own_motions_get_full_paths():
+    """A run's configuration then finds packaged motions in any installation."""
+    write_clip(still(), load_robot("g1"), Path("still.npz"))
+    files = ["g1/kick.npz", str(data_folder("resources") / "motions" / "g1" / "walk.npz"), "still.npz"]
+    cfg = task_config("g1_tracking", [("motion.files", files)], on_cpu=True)
+    assert cfg.motion.files == ("g1/kick.npz", "g1/walk.npz", str(Path("still.npz").absolute()))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Ghosts: the poses of references, beside the robots that track them."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ import torch
 from helpers import ENGINE
 
 from legged.motion.kinematics import Skeleton
-from legged.motion.readers import read_clip
+from legged.motion.readers import motion_files, read_clip
 from legged.registry import make_task, task_config
 from legged.rendering.camera import RobotsCamera
 from legged.rendering.ghost import GHOST, Ghost
@@ -29,7 +27,7 @@ def task():
 
 
 def test_a_ghost_has_the_pose_of_its_reference(task):
-    clip = read_clip(Path(task.cfg.motion.files[0]), Skeleton(task.robot)).resampled(round(1.0 / task.dt))
+    clip = read_clip(motion_files(task.cfg.motion.files, "")[0], Skeleton(task.robot)).resampled(round(1.0 / task.dt))
     ghost = Ghost(task, display_model(task.robot, SHOWN, 64, 48))
     scene, offsets = mujoco.MjvScene(ghost.model, 1000), np.array([[0.0, 0.0, 0.0], [3.0, -2.0, 0.0]])
     ghost.draw(scene, mujoco.MjvOption(), FIRST, offsets)
