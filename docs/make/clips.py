@@ -140,7 +140,7 @@ def kick(skeleton: Skeleton) -> Clip:
 
     def pose(time: float) -> Pose:
         side, high, far = shift(time) - back(time), lift(time) - lower(time), swing(time) - retreat(time)
-        foot = feet[0] + [0.28 * far - 0.08 * high, -0.03 * high, 0.10 * high + 0.06 * far]
+        foot = feet[0] + [0.38 * far - 0.05 * high, -0.05 * high, 0.22 * high + 0.14 * far]
         return Pose(
             np.array([foot, feet[1]]), centre + side * (above - centre), height - 0.02 * side, toes=0.3 * high - 0.3 * far
         )

@@ -29,21 +29,27 @@ def test_a_shipped_clip_has_no_findings(skeleton, name):
 
 @pytest.mark.parametrize("name", ["squat", "kick"])
 def test_the_centre_of_mass_stays_above_the_soles_that_stand(skeleton, name):
-    """Slow motions balance if it does. Ankles turn by less than their soft limits."""
+    """Slow motions balance if it does. Ankles of feet that stay on the ground turn by less than their soft limits."""
     clip = read_clip(FOLDER / f"{name}.npz", skeleton)
     quality, feet = quality_of(clip, skeleton), skeleton.indices(clips.FEET, "test")
-    assert quality.beyond_soft == 0.0
+    sides = [side for side, sole in zip(("left", "right"), quality.soles.T, strict=True) if sole.max() < 2e-3]
+    robot = skeleton.robot
+    ankles = [i for i, joint in enumerate(robot.joint_names) if "ankle" in joint and joint.split("_")[0] in sides]
+    low, high = robot.dof_pos_limits[ankles].T
+    beyond = np.abs(clip.joint_pos[:, ankles] - 0.5 * (low + high)) - 0.45 * (high - low)
+    assert ankles
+    assert beyond.max() < 0.0
     assert np.abs(quality.lower_sole).max() < 1e-3
     for data, soles in zip(skeleton.frames(clip), quality.soles, strict=True):
         stands = [foot for foot, sole in zip(feet, soles, strict=True) if sole < 2e-3]
-        low, high = (pick(data.xpos[stands, :2] + SOLE[:, side], axis=0) for side, pick in ((0, np.min), (1, np.max)))
-        assert (low < data.subtree_com[skeleton.base, :2]).all()
-        assert (data.subtree_com[skeleton.base, :2] < high).all()
+        back, front = (pick(data.xpos[stands, :2] + SOLE[:, side], axis=0) for side, pick in ((0, np.min), (1, np.max)))
+        assert (back < data.subtree_com[skeleton.base, :2]).all()
+        assert (data.subtree_com[skeleton.base, :2] < front).all()
 
 
 def test_the_kick_lifts_a_foot_and_swings_it(skeleton):
     soles = quality_of(read_clip(FOLDER / "kick.npz", skeleton), skeleton).soles
-    assert soles[:, 0].max() > 0.1
+    assert soles[:, 0].max() > 0.3
     assert soles[:, 1].max() < 1e-3
 
 
