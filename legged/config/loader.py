@@ -226,9 +226,10 @@ def file_paths(section: Any, folder: Path) -> None:
         actuator["network"] = str((folder / name if exists(folder / name) else Path.cwd() / name).absolute())
     files = motion.get("files") if isinstance(motion, dict) else None
     if isinstance(motion, dict) and isinstance(files, list | tuple) and all(name and isinstance(name, str) for name in files):
-        places = (folder, Path.cwd(), data_folder("resources") / "motions")
+        packaged = data_folder("resources") / "motions"
+        places = (folder, Path.cwd(), packaged)
         found = [next((place / name for place in places if exists(place / name)), folder / name).absolute() for name in files]
-        motion["files"] = [str(path.relative_to(places[2]) if path.is_relative_to(places[2]) else path) for path in found]
+        motion["files"] = [str(path.relative_to(packaged) if path.is_relative_to(packaged) else path) for path in found]
 
 
 def parse_override(text: str) -> tuple[str, Any]:

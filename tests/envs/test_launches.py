@@ -43,8 +43,8 @@ def test_motors_and_sensors_with_all_their_errors_are_few_launches_more():
 
 @pytest.mark.slow
 def test_everything_random_is_few_launches_more():
-    """All properties, kicks and two forces: at most 26. Only the two of kicks and forces are in the step's main line; `draw`
-    and what is drawn again in `reset_idx` run beside it.
+    """All properties, kicks and two forces: at most 26. Only the two of kicks and forces are in the step's main line. The
+    launches of `draw`, and those of `reset_idx` that redraw properties, are on a second stream.
     """
     without, everything = launches_of("anymal_c_flat"), launches_of("anymal_c_flat", ALL)
     more = {name: count - without[name] for name, count in everything.items() if count > without[name]}
